@@ -1,0 +1,1 @@
+"""Camera rigs: from pictures of a target to cameras that can be trusted."""

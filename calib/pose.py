@@ -1,0 +1,54 @@
+"""Rigid transforms as (3, 4) float64 matrices ``[R | t]``.
+
+``b_from_a`` maps coordinates in frame a to frame b: ``x_b = R @ x_a + t``, so that in
+``a_from_b`` after ``b_from_c`` the inner names meet. Translations are metres.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pose = NDArray[np.float64]
+
+
+def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
+    """Return ``a_from_c``, both (3, 4)."""
+    rotation = a_from_b[:, :3] @ b_from_c[:, :3]
+    translation = a_from_b[:, :3] @ b_from_c[:, 3] + a_from_b[:, 3]
+    return np.column_stack([rotation, translation])
+
+
+def invert(b_from_a: Pose) -> Pose:
+    """Return ``a_from_b`` of a rigid (3, 4) transform."""
+    rotation = b_from_a[:, :3].T
+    return np.column_stack([rotation, -rotation @ b_from_a[:, 3]])
+
+
+def transform(b_from_a: Pose, points_a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Map points (N, 3) from frame a to frame b."""
+    return points_a @ b_from_a[:, :3].T + b_from_a[:, 3]
+
+
+def rotation_about_axes(rotate_deg: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return the (3, 3) rotation about x, then y, then z of the fixed frame, in degrees."""
+    rotation = np.eye(3)
+    for axis, angle_deg in enumerate(rotate_deg):
+        cosine, sine = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = cosine, -sine, sine, cosine
+        rotation = turn @ rotation
+    return rotation
+
+
+def angle_between(first: Pose, second: Pose) -> float:
+    """Return the angle in radians between the rotations of two poses."""
+    relative = first[:, :3].T @ second[:, :3]
+    # atan2 of both parts: arccos alone loses half the digits at small angles.
+    axis = np.array(
+        [
+            relative[2, 1] - relative[1, 2],
+            relative[0, 2] - relative[2, 0],
+            relative[1, 0] - relative[0, 1],
+        ]
+    )
+    return float(np.arctan2(np.linalg.norm(axis), np.trace(relative) - 1.0))

@@ -1,0 +1,1 @@
+"""From a recording to contacts between real things and CAD."""

@@ -1,0 +1,1 @@
+"""What was recorded: sessions, frames, backgrounds, silhouettes in the image."""

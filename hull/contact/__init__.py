@@ -1,0 +1,1 @@
+"""CAD objects, and their contacts with the hull."""

@@ -1,0 +1,1 @@
+"""The volume query: which samples of a triangle lie inside the visual hull."""

@@ -1,0 +1,111 @@
+"""Where the samples of a triangle are.
+
+A triangle with vertices a, b, c is laid into half of its u x u viewport with its vertices on the
+centres of three corner pixels. Its samples are the u(u+1)/2 positions::
+
+    a + (b - a) i / (u - 1) + (c - a) j / (u - 1),    i, j >= 0,  i + j <= u - 1
+
+(the centroid for u = 1), the same for every engine. Vertices and edges are always sampled, and a
+sliver loses nothing, since no triangle is ever seen on edge. The spacing along an edge is
+edge / (u - 1), the accuracy of section 4.4.3 of the paper; u - 1 doubled contains all samples of
+u - 1.
+
+Samples are numbered row by row, j = 0 first: sample (i, j) is number ``j u - j (j - 1) / 2 + i``.
+An engine returns numbers; positions come from here alone.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: More samples an edge than a 16-bit image is wide serve nobody, and their count stays below 2^31.
+MAX_VIEWPORT = 65_535
+
+
+def n_samples(viewport: int) -> int:
+    """Return how many samples a viewport of `viewport` pixels a side takes of a triangle."""
+    return viewport * (viewport + 1) // 2
+
+
+def sample_steps(
+    viewports: NDArray[np.int32], samples: NDArray[np.uint32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the steps i, j of numbered samples.
+
+    Parameters
+    ----------
+    viewports : (N,) int32
+        The viewport of each sample's triangle.
+    samples : (N,) uint32
+        Numbers of samples in their viewports.
+
+    Examples
+    --------
+    The six samples of a 3 x 3 viewport:
+
+    >>> i, j = sample_steps(np.full(6, 3, np.int32), np.arange(6, dtype=np.uint32))
+    >>> list(zip(i.tolist(), j.tolist()))
+    [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (0, 2)]
+    """
+    u = viewports.astype(np.int64)
+    number = samples.astype(np.int64)
+    # Rows above row j hold j u - j (j - 1) / 2 samples; solve for j, then mend the rounding.
+    j = np.floor((2 * u + 1 - np.sqrt((2.0 * u + 1) ** 2 - 8.0 * number)) / 2).astype(np.int64)
+    j += (j + 1) * u - (j + 1) * j // 2 <= number
+    j -= j * u - j * (j - 1) // 2 > number
+    i = number - (j * u - j * (j - 1) // 2)
+    return i, j
+
+
+def sample_positions(
+    corners: NDArray[np.float64],
+    viewports: NDArray[np.int32],
+    samples: NDArray[np.uint32],
+) -> NDArray[np.float64]:
+    """Return where numbered samples lie.
+
+    Parameters
+    ----------
+    corners : (N, 3, 3) float64
+        Vertices a, b, c of each sample's triangle, in any frame.
+    viewports : (N,) int32
+        The viewport of each sample's triangle.
+    samples : (N,) uint32
+        Numbers of samples in their viewports.
+
+    Returns
+    -------
+    (N, 3) float64
+        Positions in the frame of the corners.
+    """
+    i, j = sample_steps(viewports, samples)
+    steps = np.maximum(viewports.astype(np.float64) - 1.0, 1.0)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    positions = a + (b - a) * (i / steps)[:, None] + (c - a) * (j / steps)[:, None]
+    single = viewports == 1
+    positions[single] = corners[single].mean(axis=1)
+    return positions
+
+
+def viewports_for_accuracy(corners: NDArray[np.float64], accuracy_m: float) -> NDArray[np.int32]:
+    """Return for each triangle the smallest viewport that samples its edges `accuracy_m` apart.
+
+    Parameters
+    ----------
+    corners : (T, 3, 3) float64
+        Vertices in metres.
+    accuracy_m : float
+        The largest spacing of samples along an edge, in metres.
+
+    Raises
+    ------
+    ValueError
+        If a triangle would need more than `MAX_VIEWPORT`.
+    """
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)  # (T, 3)
+    needed = np.ceil(edges.max(axis=1, initial=0.0) / accuracy_m) + 1
+    if (needed > MAX_VIEWPORT).any():
+        raise ValueError(
+            f"an edge of {edges.max():.3g} m sampled every {accuracy_m:.3g} m needs a viewport of "
+            f"{needed.max():.0f}, more than {MAX_VIEWPORT}"
+        )
+    return np.asarray(np.maximum(needed, 2), dtype=np.int32)

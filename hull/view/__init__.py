@@ -1,0 +1,1 @@
+"""Pictures of the hull and the CAD."""
