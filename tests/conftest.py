@@ -1,0 +1,28 @@
+"""Fixtures of all tests."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+PROJECT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(autouse=True)
+def _numerical_errors_raise() -> Iterator[None]:
+    with np.errstate(divide="raise", over="raise", invalid="raise"):
+        yield
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """The folder of real recordings; without it a test is skipped, except in CI, where it fails."""
+    folder = Path(os.environ.get("HYBRIDVE_DATA", PROJECT.parent / "shared" / "data"))
+    if not (folder / "horseman").is_dir():
+        message = f"the real recordings are not in {folder}; set HYBRIDVE_DATA to their folder"
+        if os.environ.get("CI"):
+            pytest.fail(message)
+        pytest.skip(message)
+    return folder
