@@ -1,0 +1,37 @@
+# make demo    the whole job on a generated session
+# make test    everything that must hold: style, types, import contracts, tests
+# make bench   the benchmarks, with the numbers of the README
+# make lock    renew requirements.lock after a change of pyproject.toml
+
+BIN := .venv/bin
+
+.PHONY: demo test check pytest bench lock setup clean
+
+demo: setup
+	$(BIN)/hybridve demo -o demo --overwrite
+
+test: check pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml -p hybridve
+	$(BIN)/lint-imports
+
+pytest: setup
+	$(BIN)/pytest
+
+bench: setup
+	$(BIN)/pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' \
+		--benchmark-columns=median,iqr,min,rounds --benchmark-sort=fullname
+
+lock: setup
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-header \
+		--python-version 3.11 --quiet -o requirements.lock
+
+setup:
+	@bash .ci/setup
+
+clean:
+	rm -rf .venv build demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

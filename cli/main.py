@@ -1,0 +1,79 @@
+"""The command ``hybridve``: its sub-commands, and the one place where errors become text."""
+
+import logging
+import os
+import sys
+from importlib.metadata import version
+from typing import NoReturn
+
+import click
+
+from hybridve.calib.errors import HybridveError
+from hybridve.cli.calibrate import calibrate
+from hybridve.cli.demo import demo
+from hybridve.cli.detect import detect
+from hybridve.cli.doctor import doctor
+from hybridve.cli.render import render
+from hybridve.cli.segment import segment
+from hybridve.cli.summary import summary
+from hybridve.cli.synth import synth
+
+#: Exit status of a run that was interrupted, as shells have it: 128 + SIGINT.
+_INTERRUPTED = 130
+
+
+class _InOrder(click.Group):
+    """Lists commands in the order of the work, not of the alphabet."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+
+@click.group(cls=_InOrder, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(version("hybridve"), prog_name="hybridve")
+@click.option("-v", "--verbose", count=True, help="Tell more on stderr; twice for everything.")
+@click.option("-q", "--quiet", is_flag=True, help="Tell only errors on stderr.")
+def cli(verbose: int, quiet: bool) -> None:
+    r"""Tell what real thing in a recording touched which CAD part, frame by frame.
+
+    \b
+    The whole job on a recording:
+      hybridve calibrate my_session
+      hybridve detect my_session --scene scene.toml -o report.h5
+      hybridve summary report.h5
+
+    Results go to stdout, progress to stderr. Exit status: 0 done (a collision found is a result),
+    1 a problem you can fix, 2 wrong usage, 3 something clashes and --fail-on-clash was given,
+    130 interrupted.
+    """
+    level = (
+        logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    )
+    logging.basicConfig(
+        stream=sys.stderr, level=level, format="%(levelname)s: %(message)s", force=True
+    )
+
+
+for command in (demo, synth, calibrate, segment, detect, summary, render, doctor):
+    cli.add_command(command)
+
+
+def main() -> NoReturn:
+    """Run the command line and leave with its exit status."""
+    try:
+        cli.main(standalone_mode=False)
+    except click.ClickException as error:  # wrong usage
+        error.show()
+        sys.exit(error.exit_code)
+    except HybridveError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("interrupted", err=True)
+        sys.exit(_INTERRUPTED)
+    except BrokenPipeError:  # the reader of stdout, head for example, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except click.exceptions.Exit as stop:
+        sys.exit(stop.exit_code)
+    sys.exit(0)

@@ -1,0 +1,431 @@
+"""The silhouettes of a session, frame by frame, from all cameras side by side.
+
+Each camera is read and segmented in a thread of its own, a few frames ahead of whoever asks. The
+threads spend their time in OpenCV, which leaves Python's lock alone. Memory does not grow with the
+length of the recording.
+"""
+
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import SessionError
+from hybridve.calib.image_io import FrameSource, Image
+from hybridve.calib.lens import Undistortion
+from hybridve.hull.capture.background import learn_background
+from hybridve.hull.capture.segment import Segmenter, threshold_mask
+from hybridve.hull.capture.session import Session, SessionCamera
+from hybridve.hull.capture.silhouette_io import SilhouetteReader
+
+Mask = NDArray[np.uint8]
+
+#: How many frames a camera is read ahead: enough to smooth out a slow frame.
+_READ_AHEAD = 3
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRange:
+    """Which frames of a recording to look at: start, start + step, ... before stop."""
+
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):
+            raise SessionError(
+                f"frames {self}: no frame is in it; expected START:STOP or START:STOP:STEP with "
+                "0 <= START < STOP and STEP >= 1"
+            )
+
+    def __str__(self) -> str:
+        return f"{self.start}:{'' if self.stop is None else self.stop}:{self.step}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSilhouettes:
+    """The silhouettes of one frame.
+
+    Attributes
+    ----------
+    index : int
+        Number of the frame in the session.
+    masks : list of (H, W) uint8, or None
+        Per camera 1 on object pixels; None if a camera has no picture of this frame.
+    reason : str
+        Why `masks` is None; else empty.
+    decode_s, segment_s : float
+        Seconds of work, summed over the cameras, which run side by side.
+    """
+
+    index: int
+    masks: list[Mask] | None
+    reason: str
+    decode_s: float
+    segment_s: float
+
+
+def check_recording(session: Session) -> list[tuple[int, int]]:
+    """Look at what every camera recorded before long work starts.
+
+    Returns
+    -------
+    list of (width, height)
+        The size of each camera's pictures in pixels.
+
+    Raises
+    ------
+    SessionError
+        If a camera recorded nothing, or its background has another size than its recording.
+    """
+    sizes_px = []
+    for number, camera in enumerate(session.cameras, start=1):
+        recording = recording_of(session, camera)
+        try:
+            height, width = recording.first().shape[:2]
+        except SessionError as error:
+            raise SessionError(f"{session.path}: camera.{number}: {error}") from error
+        sizes_px.append((width, height))
+        if camera.has_masks or camera.background is None:
+            continue
+        empty_height, empty_width = camera.background.first().shape[:2]
+        if (width, height) != (empty_width, empty_height):
+            raise SessionError(
+                f"{session.path}: camera.{number}.background: {camera.background.label!r} is "
+                f"{empty_width}x{empty_height}, but {recording.label!r} is {width}x{height}; "
+                "record both with the same settings"
+            )
+    return sizes_px
+
+
+def claimed_length(session: Session) -> int:
+    """Return how many frames the session has; where videos tell it only roughly, roughly."""
+    return max(
+        recording_of(session, camera).claimed_length() + camera.shift_frames
+        for camera in session.cameras
+    )
+
+
+def check_lengths(session: Session, frames: FrameRange) -> None:
+    """Compare how much the cameras recorded.
+
+    Headers of videos are a frame or two off, so that they only raise the suspicion; frames are
+    counted where they differ.
+
+    Raises
+    ------
+    SessionError
+        If one camera stops before the frames that are asked for, and another does not.
+    """
+    recordings = [recording_of(session, camera) for camera in session.cameras]
+    claimed = [recording.claimed_length() for recording in recordings]
+    if len(set(claimed)) == 1:
+        return
+    shifts = [camera.shift_frames for camera in session.cameras]
+    lengths = [
+        recording.count() + shift for recording, shift in zip(recordings, shifts, strict=True)
+    ]
+    shortest, longest = min(lengths), max(lengths)
+    if shortest == longest or (frames.stop is not None and frames.stop <= shortest):
+        return
+    number = lengths.index(shortest)
+    key = "masks" if session.cameras[number].has_masks else "video"
+    raise SessionError(
+        f"{session.path}: camera.{number + 1}.{key}: {recordings[number].label!r} stops after "
+        f"{shortest} frames, but camera.{lengths.index(longest) + 1} has {longest}; evaluate what "
+        f"all cameras saw with --frames {frames.start}:{shortest}, or record again"
+    )
+
+
+def recording_of(session: Session, camera: SessionCamera) -> FrameSource:
+    """Return a camera's recording.
+
+    Raises
+    ------
+    SessionError
+        If the session names none.
+    """
+    if camera.recording is None:
+        raise SessionError(
+            f"{session.path}: camera {camera.name!r} has neither video nor masks; name one of them"
+        )
+    return camera.recording
+
+
+def segmented_frames(
+    session: Session,
+    frames: FrameRange,
+    *,
+    undistortions: list[Undistortion] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Iterator[FrameSilhouettes]:
+    """Yield the silhouettes of a session's frames, cut out of its recordings.
+
+    A frame that a camera lacks is yielded with the reason. The frames end where all cameras end.
+
+    Parameters
+    ----------
+    session : Session
+        The recordings.
+    frames : FrameRange
+        Which frames.
+    undistortions : list of Undistortion, optional
+        If given, lens distortion is removed from the silhouettes.
+    progress : callable, optional
+        Told ``(what, done, total)`` while the backgrounds are learnt.
+
+    Raises
+    ------
+    SessionError
+        If a camera has no recording, or no background where it needs one.
+    """
+    sources = [_mask_source(session, camera) for camera in session.cameras]
+    cutters = _make_cutters(session, progress)
+    yield from _side_by_side(session, sources, cutters, frames, undistortions)
+
+
+def stored_frames(
+    session: Session,
+    reader: SilhouetteReader,
+    frames: FrameRange,
+    *,
+    undistortions: list[Undistortion] | None = None,
+) -> Iterator[FrameSilhouettes]:
+    """Yield the silhouettes of a session's frames as they were stored by ``hybridve segment``."""
+    stop = reader.n_frames if frames.stop is None else min(frames.stop, reader.n_frames)
+    for index in range(frames.start, stop, frames.step):
+        started = time.perf_counter()
+        masks, reason = reader.frame(index)
+        decoded = time.perf_counter()
+        if masks is None:
+            yield FrameSilhouettes(index, None, reason, decoded - started, 0.0)
+            continue
+        if undistortions is not None:
+            masks = [undistort_mask(*pair) for pair in zip(masks, undistortions, strict=True)]
+        yield FrameSilhouettes(index, masks, "", decoded - started, time.perf_counter() - decoded)
+
+
+def silhouette_stamp(session: Session) -> str:
+    """Return a text that changes whenever the session's silhouettes could.
+
+    It holds the settings, and of every file involved its name, size and time of change.
+    """
+    files = []
+    for camera in session.cameras:
+        for source in (camera.background, camera.recording):
+            for path in source.paths if source is not None else ():
+                status = path.stat()
+                files.append([str(path), status.st_size, status.st_mtime_ns])
+    return json.dumps(
+        {
+            "segmentation": asdict(session.segmentation),
+            "mask_threshold": session.mask_threshold,
+            "shift_frames": [camera.shift_frames for camera in session.cameras],
+            "files": files,
+        }
+    )
+
+
+def stored_silhouettes(session: Session) -> Path | None:
+    """Return the stored silhouettes of a session, or None where none stand or they are stale."""
+    path = session.folder / "silhouettes.h5"
+    if not path.is_file():
+        return None
+    with SilhouetteReader(path) as reader:
+        return path if reader.stamp == silhouette_stamp(session) else None
+
+
+def undistort_mask(mask: Mask, undistortion: Undistortion) -> Mask:
+    """Return a silhouette without lens distortion; what the camera did not see is background."""
+    if undistortion.map_x is None or undistortion.map_y is None:
+        return mask
+    return np.asarray(
+        cv2.remap(
+            mask,
+            undistortion.map_x,
+            undistortion.map_y,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=0,
+        ),
+        np.uint8,
+    )
+
+
+def _mask_source(session: Session, camera: SessionCamera) -> FrameSource:
+    recording = recording_of(session, camera)
+    if not camera.has_masks and camera.background is None:
+        raise SessionError(
+            f"{session.path}: camera {camera.name!r} has no background; name a recording of the "
+            "empty scene"
+        )
+    return recording
+
+
+def _make_cutter(session: Session, camera: SessionCamera) -> Callable[[Image], Mask]:
+    if camera.has_masks or camera.background is None:
+        threshold = session.mask_threshold
+        return lambda image: threshold_mask(image, threshold)
+    segmenter = Segmenter(learn_background(camera.background.frames()), session.segmentation)
+    return segmenter.segment
+
+
+def _make_cutters(
+    session: Session, progress: Callable[[str, int, int], None] | None
+) -> list[Callable[[Image], Mask]]:
+    with ThreadPoolExecutor(max_workers=len(session.cameras)) as pool:
+        cutters = []
+        for cutter in pool.map(partial(_make_cutter, session), session.cameras):
+            cutters.append(cutter)
+            if progress is not None:
+                progress("background", len(cutters), len(session.cameras))
+        return cutters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cut:
+    """One camera's part of one frame, or the end of its recording."""
+
+    mask: Mask | None
+    reason: str
+    decode_s: float = 0.0
+    segment_s: float = 0.0
+    ended: bool = False
+    error: BaseException | None = None
+
+
+class _Lane(threading.Thread):
+    """Reads and segments one camera, a few frames ahead."""
+
+    def __init__(
+        self,
+        camera: SessionCamera,
+        source: FrameSource,
+        cut: Callable[[Image], Mask],
+        frames: FrameRange,
+        undistortion: Undistortion | None,
+    ) -> None:
+        super().__init__(name=f"camera {camera.name}", daemon=True)
+        self._camera = camera
+        self._source = source
+        self._cut = cut
+        self._frames = frames
+        self._undistortion = undistortion
+        self._out: queue.Queue[_Cut] = queue.Queue(maxsize=_READ_AHEAD)
+        self._stopped = threading.Event()
+
+    def next_cut(self) -> _Cut:
+        """Return the camera's part of the next frame; waits for it."""
+        return self._out.get()
+
+    def stop(self) -> None:
+        """End the thread, whatever it is at."""
+        self._stopped.set()
+        with suppress(queue.Empty):
+            while True:
+                self._out.get_nowait()
+
+    def run(self) -> None:
+        """Read, segment, undistort, hand over, until the recording ends."""
+        try:
+            for cut in self._cuts():
+                if not self._put(cut):
+                    return
+            self._put(_Cut(None, f"camera {self._camera.name!r} has stopped recording", ended=True))
+        except BaseException as error:
+            self._put(_Cut(None, "", error=error))
+
+    def _put(self, cut: _Cut) -> bool:
+        while not self._stopped.is_set():
+            with suppress(queue.Full):
+                self._out.put(cut, timeout=0.2)
+                return True
+        return False
+
+    def _cuts(self) -> Iterator[_Cut]:
+        frames, shift = self._frames, self._camera.shift_frames
+        first = frames.start
+        while first < shift and (frames.stop is None or first < frames.stop):
+            yield _Cut(None, f"camera {self._camera.name!r} has not begun to record")
+            first += frames.step
+        stop = None if frames.stop is None else frames.stop - shift
+        if stop is not None and stop <= first - shift:
+            return
+        images = self._source.frames_or_errors(first - shift, stop, frames.step)
+        shape: tuple[int, ...] | None = None
+        while True:
+            started = time.perf_counter()
+            image = next(images, None)
+            decoded = time.perf_counter()
+            if image is None:
+                return
+            if isinstance(image, SessionError):
+                yield _Cut(None, f"camera {self._camera.name!r}: {image}", decoded - started)
+                continue
+            shape = shape or image.shape
+            if image.shape != shape:
+                yield _Cut(
+                    None,
+                    f"camera {self._camera.name!r}: the picture is {image.shape[1]}x"
+                    f"{image.shape[0]}, those before are {shape[1]}x{shape[0]}",
+                    decoded - started,
+                )
+                continue
+            mask = self._cut(image)
+            if self._undistortion is not None:
+                mask = undistort_mask(mask, self._undistortion)
+            yield _Cut(mask, "", decoded - started, time.perf_counter() - decoded)
+
+
+def _side_by_side(
+    session: Session,
+    sources: list[FrameSource],
+    cutters: list[Callable[[Image], Mask]],
+    frames: FrameRange,
+    undistortions: list[Undistortion] | None,
+) -> Iterator[FrameSilhouettes]:
+    lanes = [
+        _Lane(camera, source, cutter, frames, undistortions[number] if undistortions else None)
+        for number, (camera, source, cutter) in enumerate(
+            zip(session.cameras, sources, cutters, strict=True)
+        )
+    ]
+    for lane in lanes:
+        lane.start()
+    try:
+        index = frames.start
+        last: list[_Cut | None] = [None] * len(lanes)
+        while True:
+            cuts = []
+            for number, lane in enumerate(lanes):
+                before = last[number]
+                cut = before if before is not None and before.ended else lane.next_cut()
+                if cut.error is not None:
+                    raise cut.error
+                last[number] = cut
+                cuts.append(cut)
+            if all(cut.ended for cut in cuts):
+                return
+            reasons = [cut.reason for cut in cuts if cut.mask is None]
+            yield FrameSilhouettes(
+                index,
+                None if reasons else [cut.mask for cut in cuts if cut.mask is not None],
+                "; ".join(reasons),
+                sum(0.0 if cut.ended else cut.decode_s for cut in cuts),
+                sum(0.0 if cut.ended else cut.segment_s for cut in cuts),
+            )
+            index += frames.step
+    finally:
+        for lane in lanes:
+            lane.stop()

@@ -1,0 +1,294 @@
+"""One recording through the whole chain: frames in, results out, written as they come.
+
+::
+
+    session -> silhouettes -+
+    rig --------------------+-> Hull (one frame) -> contacts -> FrameResult -> report
+    scene -> bodies --------+
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybridve.calib.errors import CalibrationError, SceneError, SessionError
+from hybridve.calib.lens import Undistortion, undistortion
+from hybridve.calib.rig import Rig
+from hybridve.calib.rig_io import import_rig, read_rig
+from hybridve.hull.capture.recording import (
+    FrameRange,
+    FrameSilhouettes,
+    check_lengths,
+    check_recording,
+    claimed_length,
+    recording_of,
+    segmented_frames,
+    stored_frames,
+    stored_silhouettes,
+)
+from hybridve.hull.capture.session import Session
+from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.contact.detect import Body, detect_contacts, make_body
+from hybridve.hull.contact.scene import Scene
+from hybridve.hull.query.engine import Engine
+from hybridve.hull.query.silhouettes import Views, make_hull, make_views
+from hybridve.hull.report.schema import FrameResult
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateSettings:
+    """How a recording is evaluated.
+
+    Attributes
+    ----------
+    frames : FrameRange
+        Which frames.
+    viewport : int or None
+        Samples along every triangle's edge.
+    accuracy_m : float or None
+        Or, instead, the largest spacing of samples along an edge: each triangle takes the smallest
+        viewport that keeps it.
+    """
+
+    frames: FrameRange = FrameRange()
+    viewport: int | None = 10
+    accuracy_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """A session, its rig and a scene, made ready.
+
+    Attributes
+    ----------
+    session, rig, scene
+        What is evaluated.
+    settings : EvaluateSettings
+        How.
+    undistortions : list of Undistortion
+        Per camera of the session.
+    views : Views
+        The cameras' pinhole images.
+    bodies : list of Body
+        The scene's objects, laid into viewports.
+    silhouettes : Path or None
+        Where stored silhouettes stand that are those of this session; None to segment now.
+    """
+
+    session: Session
+    rig: Rig
+    scene: Scene
+    settings: EvaluateSettings
+    undistortions: list[Undistortion]
+    views: Views
+    bodies: list[Body]
+    silhouettes: Path | None
+
+
+def load_rig(session: Session) -> Rig:
+    """Return the session's rig: the one it names, or the one that was calibrated for it.
+
+    Raises
+    ------
+    CalibrationError
+        If there is none, or it lacks a camera of the session, or is for images of another size.
+    """
+    sizes = {
+        camera.name: recording_of(session, camera).first().shape[1::-1]
+        for camera in session.cameras
+    }
+    if session.rig_file is not None:
+        rig = import_rig(
+            session.root,
+            session.rig_file.pattern,
+            session.rig_file.unit or "m",
+            session.rig_file.pixel_centre,
+            {name: (size[0], size[1]) for name, size in sizes.items()},
+            session.target.square_mm / 1000.0 if session.target is not None else None,
+        )
+    else:
+        path = session.folder / "rig" / "rig.json"
+        if not path.is_file():
+            raise CalibrationError(
+                f"{session.path}: there is no rig at {path}; run `hybridve calibrate "
+                f"{session.path}` first, or name one with rig ="
+            )
+        rig = read_rig(path)
+    for name, (width_px, height_px) in sizes.items():
+        camera = rig[name]
+        if (camera.width_px, camera.height_px) != (width_px, height_px):
+            raise CalibrationError(
+                f"{session.path}: camera {name!r} recorded {width_px}x{height_px}, but its rig is "
+                f"for {camera.width_px}x{camera.height_px}; calibrate it at the size recorded"
+            )
+    return rig
+
+
+def rig_views(session: Session, rig: Rig) -> tuple[Views, list[Undistortion]]:
+    """Return the session's cameras as pinhole views, and how their images become so."""
+    cameras = [rig[camera.name] for camera in session.cameras]
+    lenses = [undistortion(camera) for camera in cameras]
+    views = make_views(
+        tuple(camera.name for camera in cameras),
+        np.array([(lens.width_px, lens.height_px) for lens in lenses], np.int64),
+        np.array(
+            [
+                lens.img_from_cam @ camera.cam_from_world
+                for lens, camera in zip(lenses, cameras, strict=True)
+            ]
+        ),
+        session.unseen,
+        session.min_cameras,
+    )
+    return views, lenses
+
+
+def make_chain(session: Session, scene: Scene, settings: EvaluateSettings) -> Chain:
+    """Return everything that is the same for all frames.
+
+    Raises
+    ------
+    HybridveError
+        If recordings, rig and scene do not fit together.
+    """
+    silhouettes = stored_silhouettes(session)
+    if silhouettes is None:
+        check_recording(session)
+        check_lengths(session, settings.frames)
+    rig = load_rig(session)
+    views, undistortions = rig_views(session, rig)
+    bodies = []
+    for scene_object in scene.objects:
+        try:
+            bodies.append(
+                make_body(scene_object, viewport=settings.viewport, accuracy_m=settings.accuracy_m)
+            )
+        except ValueError as error:
+            raise SceneError(
+                f"{scene.path}: object {scene_object.name!r}: {error}; ask for less accuracy, or "
+                "refine the mesh"
+            ) from error
+    return Chain(session, rig, scene, settings, undistortions, views, bodies, silhouettes)
+
+
+def evaluate(
+    chain: Chain,
+    engine: Engine,
+    *,
+    skip: int = 0,
+    write_s: Callable[[], float] = lambda: 0.0,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Iterator[FrameResult]:
+    """Yield the result of every frame.
+
+    Parameters
+    ----------
+    chain : Chain
+        What to evaluate.
+    engine : Engine
+        What answers the volume query.
+    skip : int
+        How many frames at the start are done already.
+    write_s : callable
+        Tells how long the last write took; it is kept with the frame that follows it.
+    progress : callable, optional
+        Told ``(what, done, total)`` while the backgrounds are learnt.
+
+    Raises
+    ------
+    SessionError
+        If the recording has none of the frames asked for.
+    """
+    n_yielded = 0
+    for silhouettes in _silhouettes(chain, skip, progress):
+        started = time.perf_counter()
+        contacts = ()
+        if silhouettes.masks is not None:
+            hull = make_hull(chain.views, silhouettes.masks)
+            contacts = tuple(detect_contacts(hull, chain.bodies, engine))
+        yield FrameResult(
+            index=silhouettes.index,
+            time_s=silhouettes.index / chain.session.fps,
+            reason=silhouettes.reason,
+            contacts=contacts,
+            stage_s={
+                "decode": silhouettes.decode_s,
+                "segment": silhouettes.segment_s,
+                "query": time.perf_counter() - started,
+                "write": write_s(),
+            },
+        )
+        n_yielded += 1
+    if n_yielded + skip == 0:
+        raise SessionError(
+            f"{chain.session.path}: the recording has none of the frames "
+            f"{chain.settings.frames}; it may be empty or shorter"
+        )
+
+
+def count_frames(chain: Chain) -> int:
+    """Return how many frames there are to evaluate; where videos tell it only roughly, roughly."""
+    frames = chain.settings.frames
+    if chain.silhouettes is not None:
+        with SilhouetteReader(chain.silhouettes) as reader:
+            length = reader.n_frames
+    else:
+        length = claimed_length(chain.session)
+    stop = length if frames.stop is None else min(length, frames.stop)
+    return len(range(frames.start, max(stop, frames.start), frames.step))
+
+
+def resolved_settings(chain: Chain) -> dict[str, Any]:
+    """Return all that decides the result of an evaluation, as plain JSON values."""
+    session = chain.session
+    return {
+        "session": str(session.path),
+        "session_sha256": session.checksum,
+        "scene": str(chain.scene.path),
+        "scene_sha256": chain.scene.checksum,
+        "frames": str(chain.settings.frames),
+        "viewport": chain.settings.viewport,
+        "accuracy_m": chain.settings.accuracy_m,
+        "unseen": session.unseen,
+        "min_cameras": session.min_cameras,
+        "mask_threshold": session.mask_threshold,
+        "segmentation": asdict(session.segmentation),
+        "silhouettes": None if chain.silhouettes is None else str(chain.silhouettes),
+        "local_origin_m": chain.views.origin_world.tolist(),
+    }
+
+
+def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
+    """Return what the report says of each object, as plain JSON values."""
+    return tuple(
+        {
+            "name": body.name,
+            "mesh": str(scene_object.mesh_path),
+            "triangles": len(body.triangles),
+            "largest_viewport": int(body.triangles.viewports.max()),
+            "sample_spacing_m": body.spacing_m,
+            "required_clearance_m": scene_object.required_clearance_m,
+        }
+        for scene_object, body in zip(chain.scene.objects, chain.bodies, strict=True)
+    )
+
+
+def _silhouettes(
+    chain: Chain, skip: int, progress: Callable[[str, int, int], None] | None
+) -> Iterator[FrameSilhouettes]:
+    frames = chain.settings.frames
+    start = frames.start + skip * frames.step
+    if frames.stop is not None and start >= frames.stop:
+        return
+    rest = FrameRange(start, frames.stop, frames.step)
+    if chain.silhouettes is not None:
+        with SilhouetteReader(chain.silhouettes) as reader:
+            yield from stored_frames(chain.session, reader, rest, undistortions=chain.undistortions)
+        return
+    yield from segmented_frames(
+        chain.session, rest, undistortions=chain.undistortions, progress=progress
+    )

@@ -1,0 +1,47 @@
+"""The machine and the software that made a result, as a report remembers them."""
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+#: The packages whose versions decide a result.
+PACKAGES = (
+    "hybridve",
+    "numpy",
+    "opencv-python-headless",
+    "pycolmap",
+    "numba",
+    "moderngl",
+    "h5py",
+    "open3d-cpu",
+    "open3d",
+)
+
+
+def software_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide a result."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:  # one of open3d-cpu and open3d is not there
+            continue
+    return versions
+
+
+def n_threads() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def machine_text() -> str:
+    """Return the machine in words: system, processor, processors to use."""
+    processor = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                processor = line.split(":", 1)[1].strip()
+                break
+    return f"{platform.system()} {platform.release()}, {processor}, {n_threads()} processors"

@@ -1,0 +1,157 @@
+"""Reports as they are read back: known versions only, damage told in one line."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import ReportError
+from hybridve.hull.report.schema import FORMAT, STAGES, VERSION
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectColumns:
+    """One object's rows, F of them.
+
+    Attributes
+    ----------
+    collides : (F,) bool
+    n_points, n_triangles : (F,) uint32
+    certificate : (F,) str
+    offset : (F + 1,) uint64
+        The collision points of row f are ``offset[f]`` to ``offset[f + 1]``; see `read_points`.
+    about : dict
+        Attributes: the mesh, its number of triangles, the spacing of its samples.
+    """
+
+    collides: NDArray[np.bool_]
+    n_points: NDArray[np.uint32]
+    n_triangles: NDArray[np.uint32]
+    certificate: NDArray[np.str_]
+    offset: NDArray[np.uint64]
+    about: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """A report without its collision points, which may be many.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    attributes : dict
+        What it says of itself: created_utc, command, engine, renderer, machine, versions.
+    settings, rig : dict
+        The resolved configuration and the rig.
+    index : (F,) uint32
+        Numbers of the frames.
+    time_s : (F,) float64
+        When they were recorded.
+    reason : (F,) str
+        Why a frame could not be evaluated; empty if it was.
+    stage_s : dict of (F,) float64
+        Seconds of work by stage.
+    objects : dict of ObjectColumns
+        By name.
+    """
+
+    path: Path
+    attributes: dict[str, Any]
+    settings: dict[str, Any]
+    rig: dict[str, Any]
+    index: NDArray[np.uint32]
+    time_s: NDArray[np.float64]
+    reason: NDArray[np.str_]
+    stage_s: dict[str, NDArray[np.float64]]
+    objects: dict[str, ObjectColumns]
+
+
+def read_report(path: Path) -> Report:
+    """Return what a report holds, except the collision points.
+
+    Raises
+    ------
+    ReportError
+        If there is no such file, it is not a report, of an unknown version, or damaged.
+    """
+    with _open(path) as file:
+        frames = file["hybridve/frames"]
+        return Report(
+            path=path,
+            attributes={name: _plain(value) for name, value in file.attrs.items()},
+            settings=json.loads(file["hybridve/settings/configuration"].asstr()[()]),
+            rig=json.loads(file["hybridve/settings/rig"].asstr()[()]),
+            index=frames["index"][:],
+            time_s=frames["time_s"][:],
+            reason=frames["reason"].asstr()[:].astype(np.str_),
+            stage_s={name: frames[f"stage_s/{name}"][:] for name in STAGES},
+            objects={
+                name: ObjectColumns(
+                    collides=group["collides"][:],
+                    n_points=group["n_points"][:],
+                    n_triangles=group["n_triangles"][:],
+                    certificate=group["certificate"].asstr()[:].astype(np.str_),
+                    offset=group["points/offset"][:],
+                    about={key: _plain(value) for key, value in group.attrs.items()},
+                )
+                for name, group in file["hybridve/objects"].items()
+            },
+        )
+
+
+def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return one object's collision points of one row.
+
+    Returns
+    -------
+    xyz_m : (P, 3) float32
+        World frame, metres.
+    triangle : (P,) uint32
+        The triangle that each lies on.
+
+    Raises
+    ------
+    ReportError
+        As `read_report`, or if there is no such object.
+    """
+    with _open(path) as file:
+        if f"hybridve/objects/{name}" not in file:
+            known = ", ".join(file["hybridve/objects"])
+            raise ReportError(f"{path}: there is no object {name!r}; it has {known}")
+        points = file[f"hybridve/objects/{name}/points"]
+        start, stop = (int(value) for value in points["offset"][row : row + 2])
+        return points["xyz_m"][start:stop], points["triangle"][start:stop]
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[h5py.File]:
+    if not path.is_file():
+        raise ReportError(f"{path}: there is no such report")
+    try:
+        with h5py.File(path, "r") as file:
+            found = _plain(file.attrs.get("format", "an unknown format"))
+            if found != FORMAT:
+                raise ReportError(f"{path}: holds {found}, expected {FORMAT}")
+            version = int(file.attrs["version"])
+            if version != VERSION:
+                raise ReportError(
+                    f"{path}: report version {version}, this hybridve reads {VERSION}; "
+                    "use the version that wrote it"
+                )
+            yield file
+    except (OSError, KeyError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise ReportError(f"{path}: not a readable report, or damaged: {text}") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    return value.tolist() if isinstance(value, np.ndarray) else value
