@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from hybridve.calib.errors import SceneError
 from hybridve.calib.pose import rotation_about_axes
-from hybridve.hull.capture.session import expand_root, explain_validation, read_toml
 from hybridve.hull.contact.mesh import read_mesh
+from hybridve.hull.toml_io import expand_root, explain_validation, read_toml
 
 #: How many metres one unit of a mesh file is.
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}

@@ -220,12 +220,15 @@ class ReportWriter:
             "the collision points of row f are points offset[f] to offset[f + 1]",
         )
         total = int(offset[-1])
-        chunk = min(max(total, 1), _CHUNK_POINTS)
-        xyz = group.create_dataset("points/xyz_m", (total, 3), "f4", chunks=(chunk, 3), **_STORED)
+        # Growing shapes only because HDF5 allows chunks larger than the data in no others.
+        chunk = _CHUNK_POINTS if total > _CHUNK_POINTS else max(total, 1)
+        xyz = group.create_dataset(
+            "points/xyz_m", (total, 3), "f4", chunks=(chunk, 3), maxshape=(None, 3), **_STORED
+        )
         xyz.attrs["unit"] = "m"
         xyz.attrs["description"] = "collision points CP_i, world frame"
         triangle = group.create_dataset(
-            "points/triangle", (total,), "u4", chunks=(chunk,), **_STORED
+            "points/triangle", (total,), "u4", chunks=(chunk,), maxshape=(None,), **_STORED
         )
         triangle.attrs["unit"] = "1"
         triangle.attrs["description"] = "number of the triangle that the collision point lies on"

@@ -1,0 +1,289 @@
+"""A report is complete or absent, and what is written is what is read."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hybridve.calib.errors import ReportError
+from hybridve.hull.contact.detect import Contact
+from hybridve.hull.report import write
+from hybridve.hull.report.read import read_points, read_report
+from hybridve.hull.report.schema import STAGES, FrameResult, ReportHeader
+from hybridve.hull.report.summarize import spans, summarize
+from hybridve.hull.report.write import ReportWriter
+
+# The settings of HDF5 do not matter here; small parts make the joins between them happen.
+_FEW = settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def a_header(n_objects: int, **changes: Any) -> ReportHeader:
+    values: dict[str, Any] = {
+        "command": "hybridve detect",
+        "objects": tuple({"name": f"object_{i}", "triangles": 12} for i in range(n_objects)),
+        "settings": {"viewport": 10},
+        "rig": {"cameras": []},
+        "engine": "native",
+        "renderer": "a processor",
+    }
+    return ReportHeader(**(values | changes))
+
+
+@st.composite
+def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    results = []
+    for index in range(draw(st.integers(1, 9))):
+        reason = draw(st.sampled_from(["", "", "", "camera 'ü' has stopped recording"]))
+        contacts = []
+        for _ in range(0 if reason else n_objects):
+            n_points = draw(st.integers(0, 4))
+            certificate = "colliding" if n_points else draw(st.sampled_from(["free", ""]))
+            contacts.append(
+                Contact(
+                    certificate,
+                    rng.normal(size=(n_points, 3)).astype(np.float32),
+                    np.sort(rng.integers(0, 3, n_points)).astype(np.uint32),
+                )
+            )
+        stage_s = dict(zip(STAGES, rng.uniform(size=len(STAGES)).tolist(), strict=True))
+        results.append(FrameResult(index, index / 25, reason, tuple(contacts), stage_s))
+    return results
+
+
+def write_all(path: Path, results: list[FrameResult], **options: Any) -> None:
+    with ReportWriter(path, a_header(2), **options) as writer:
+        for result in results[writer.n_done :]:
+            writer.append(result)
+        writer.finish()
+
+
+def datasets(path: Path, *, but: str = "stage_s") -> dict[str, bytes]:
+    found: dict[str, bytes] = {}
+
+    def keep(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and but not in name:
+            found[name] = np.asarray(item[()]).tobytes()
+
+    with h5py.File(path) as file:
+        file.visititems(keep)
+    return found
+
+
+@_FEW
+@given(results=frame_results())
+def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]) -> None:
+    path = tmp_path / "report.h5"
+
+    write_all(path, results, overwrite=True)
+
+    report = read_report(path)
+    assert report.index.tolist() == [result.index for result in results]
+    assert report.reason.tolist() == [result.reason for result in results]
+    assert list(report.objects) == ["object_0", "object_1"]
+    for stage in STAGES:
+        assert report.stage_s[stage].tolist() == [result.stage_s[stage] for result in results]
+    for number, rows in enumerate(report.objects.values()):
+        for row, result in enumerate(results):
+            xyz_m, triangle = read_points(path, f"object_{number}", row)
+            if result.reason:
+                assert not rows.collides[row]
+                assert rows.certificate[row] == ""
+                assert len(xyz_m) == 0
+                continue
+            contact = result.contacts[number]
+            assert rows.collides[row] == contact.collides
+            assert rows.n_triangles[row] == len(set(contact.triangle.tolist()))
+            assert rows.certificate[row] == contact.certificate
+            np.testing.assert_array_equal(xyz_m, contact.points_world)
+            np.testing.assert_array_equal(triangle, contact.triangle)
+
+
+@_FEW
+@given(results=frame_results(), data=st.data())
+def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, results: list[FrameResult], data: st.DataObject
+) -> None:
+    monkeypatch.setattr(write, "_PART_FRAMES", data.draw(st.integers(1, 4)))
+    cut = data.draw(st.integers(1, len(results)))
+    whole, resumed = tmp_path / "whole.h5", tmp_path / "resumed.h5"
+    resumed.unlink(missing_ok=True)
+    write_all(whole, results, overwrite=True)
+
+    def write_until_cut_off() -> None:
+        with ReportWriter(resumed, a_header(2)) as writer:
+            for result in results[:cut]:
+                writer.append(result)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_until_cut_off()
+    assert not resumed.exists()
+    write_all(resumed, results, resume=True)
+
+    assert datasets(resumed) == datasets(whole)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["resumed.h5", "whole.h5"]
+
+
+def one_result() -> list[FrameResult]:
+    contact = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+    return [FrameResult(0, 0.0, "", (contact, contact), dict.fromkeys(STAGES, 0.0))]
+
+
+def test_a_killed_run_leaves_finished_parts_that_can_be_taken_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(write, "_PART_FRAMES", 1)
+    path = tmp_path / "report.h5"
+    killed = ReportWriter(path, a_header(2))  # never left, as after SIGKILL
+    killed.append(one_result()[0])
+    (tmp_path / "report.h5.parts" / "000000001.partial").write_bytes(b"half a part")
+
+    writer = ReportWriter(path, a_header(2), resume=True)
+
+    assert writer.n_done == 1
+
+
+def test_an_interrupted_run_without_a_frame_leaves_nothing(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with ReportWriter(tmp_path / "report.h5", a_header(2)):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_cannot_be_taken_up_with_other_settings(tmp_path: Path) -> None:
+    path = tmp_path / "report.h5"
+    ReportWriter(path, a_header(2))
+
+    with pytest.raises(ReportError, match="other settings"):
+        ReportWriter(path, a_header(2, settings={"viewport": 20}), resume=True)
+
+
+def test_parts_of_another_run_are_not_thrown_away_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "report.h5"
+    ReportWriter(path, a_header(2))
+
+    with pytest.raises(ReportError, match="--resume"):
+        ReportWriter(path, a_header(2))
+
+
+def test_an_existing_report_is_kept_unless_overwriting_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "report.h5"
+    path.write_text("precious", encoding="utf-8")
+
+    with pytest.raises(ReportError, match="--overwrite"):
+        ReportWriter(path, a_header(2))
+
+    assert path.read_text(encoding="utf-8") == "precious"
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ReportError, match="there is no folder"):
+        ReportWriter(tmp_path / "nowhere" / "report.h5", a_header(2))
+
+
+@pytest.fixture
+def report(tmp_path: Path) -> Path:
+    path = tmp_path / "report.h5"
+    write_all(path, one_result())
+    return path
+
+
+def test_every_dataset_says_its_unit_and_meaning_and_is_checked(report: Path) -> None:
+    def check(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            assert item.attrs["unit"], name
+            assert item.attrs["description"], name
+            if item.shape:
+                assert item.compression == "gzip", name
+                assert item.shuffle, name
+                assert item.fletcher32, name
+
+    with h5py.File(report) as file:
+        file.visititems(check)
+        assert dict(file.attrs)["format"] == "hybridve-report"
+        assert file.attrs["version"] == 1
+
+
+def test_another_version_is_refused_by_name(report: Path) -> None:
+    with h5py.File(report, "r+") as file:
+        file.attrs["version"] = 7
+
+    with pytest.raises(ReportError, match="report version 7"):
+        read_report(report)
+
+
+def test_a_flipped_byte_is_noticed(tmp_path: Path, report: Path) -> None:
+    with h5py.File(report) as file:
+        chunk = file["hybridve/frames/time_s"].id.get_chunk_info(0)
+    damaged = tmp_path / "damaged.h5"
+    shutil.copy(report, damaged)
+    with damaged.open("r+b") as stream:
+        stream.seek(chunk.byte_offset)
+        byte = stream.read(1)
+        stream.seek(chunk.byte_offset)
+        stream.write(bytes([byte[0] ^ 0x10]))
+
+    with pytest.raises(ReportError, match="damaged"):
+        read_report(damaged)
+
+
+@pytest.mark.parametrize("content", [b"", b"not HDF5 at all"])
+def test_a_file_that_is_no_report_is_told_in_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "other.h5"
+    path.write_bytes(content)
+
+    with pytest.raises(ReportError, match="not a readable report") as caught:
+        read_report(path)
+
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_object_is_named_with_those_there_are(report: Path) -> None:
+    with pytest.raises(ReportError, match="object_0, object_1"):
+        read_points(report, "object_9", 0)
+
+
+@given(flags=st.lists(st.booleans(), max_size=20))
+def test_spans_cover_the_true_flags_and_nothing_else(flags: list[bool]) -> None:
+    found = spans(np.array(flags, np.bool_))
+
+    covered = [False] * len(flags)
+    for first, last in found:
+        assert first <= last
+        assert first == 0 or not flags[first - 1]
+        assert last == len(flags) - 1 or not flags[last + 1]
+        covered[first : last + 1] = [True] * (last + 1 - first)
+    assert covered == flags
+
+
+def test_an_object_is_called_free_only_if_every_evaluated_frame_is_proved(tmp_path: Path) -> None:
+    nothing = (np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+    free, sampled = Contact("free", *nothing), Contact("", *nothing)
+    stage_s = dict.fromkeys(STAGES, 0.0)
+    path = tmp_path / "report.h5"
+
+    write_all(
+        path,
+        [
+            FrameResult(0, 0.0, "", (free, free), stage_s),
+            FrameResult(1, 0.1, "camera gone", (), stage_s),
+            FrameResult(2, 0.2, "", (free, sampled), stage_s),
+        ],
+    )
+
+    numbers = summarize(read_report(path))
+    assert [found["verdict"] for found in numbers["objects"]] == ["free", "clear"]
+    assert numbers["frames_invalid"] == 1
+    assert numbers["reasons"] == {"camera gone": 1}
