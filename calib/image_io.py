@@ -85,6 +85,19 @@ class FrameSource:
         for path in self.paths[start:stop:step]:
             yield read_image(path)
 
+    def frames_or_errors(
+        self, start: int = 0, stop: int | None = None, step: int = 1
+    ) -> Iterator[Image | SessionError]:
+        """Yield what `frames` does, with a `SessionError` in the place of a damaged image."""
+        if self.is_video:
+            yield from self._video_frames(start, stop, step)
+            return
+        for path in self.paths[start:stop:step]:
+            try:
+                yield read_image(path)
+            except SessionError as error:
+                yield error
+
     def _video_frames(self, start: int, stop: int | None, step: int) -> Iterator[Image]:
         video = _open_video(self.paths[0], self.label)
         try:

@@ -11,7 +11,6 @@ from hybridve.cli.progress import StageProgress, progress_bar
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
-    from hybridve.hull.query.engine import EngineName
 
 
 @click.command(short_help="Find what the recording touched, into a report.")
@@ -41,7 +40,7 @@ def detect(
     output: Path,
     viewport: int | None,
     accuracy_mm: float | None,
-    engine: "EngineName",
+    engine: options.EngineName,
     frames: "FrameRange",
     resume: bool,
     overwrite: bool,

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import click
+
+EngineName = Literal["auto", "compute", "native", "reference"]
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
@@ -59,7 +61,7 @@ frames_option = click.option(
 )
 engine_option = click.option(
     "--engine",
-    type=click.Choice(["auto", "compute", "native", "reference"]),
+    type=click.Choice(get_args(EngineName)),
     default="auto",
     show_default=True,
     help="What answers the volume query: compute (OpenGL 4.3), native (CPU), reference (slow).",

@@ -9,7 +9,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ class EvaluateSettings:
         viewport that keeps it.
     """
 
-    frames: FrameRange = FrameRange()
+    frames: FrameRange = field(default_factory=FrameRange)
     viewport: int | None = 10
     accuracy_m: float | None = None
 

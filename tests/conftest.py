@@ -1,7 +1,8 @@
 """Fixtures of all tests."""
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,3 +27,18 @@ def recordings() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return folder
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Run ``hybridve`` with arguments, in this process; returns the exit status."""
+
+    def run_command(*arguments: object) -> int:
+        from hybridve.cli.main import main
+
+        monkeypatch.setattr(sys, "argv", ["hybridve", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        return int(left.value.code or 0)
+
+    return run_command

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
 from hybridve.hull.report.schema import FORMAT, STAGES, VERSION, FrameResult, ReportHeader
+from hybridve.hull.report.vtk import add_vtkhdf, by_frame
 
 #: A part is finished after this many frames or collision points, whichever comes first.
 _PART_FRAMES = 64
@@ -190,6 +191,18 @@ class ReportWriter:
                 if name != "name":
                     group.attrs[name] = value
             self._write_object(group, number, frame)
+        numbers = range(len(header.objects))
+        add_vtkhdf(
+            file,
+            (
+                by_frame(
+                    [columns[f"n_points_{number}"] for number in numbers],
+                    [columns[f"xyz_{number}"] for number in numbers],
+                    [columns[f"triangle_{number}"] for number in numbers],
+                )
+                for columns in self._part_columns()
+            ),
+        )
 
     def _write_object(self, group: h5py.Group, number: int, frame: dict[str, NDArray[Any]]) -> None:
         n_points = frame[f"n_points_{number}"]

@@ -1,0 +1,331 @@
+"""``hybridve detect`` as a user runs it, on a ball whose place is known in every frame."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from helpers.sessions import BALL_RADIUS_M, write_ball_session, write_cube_scene
+
+from hybridve.hull.report.read import read_points, read_report
+
+Run = Callable[..., int]
+
+#: The ball comes along x from far to well beyond the cube at the origin.
+CENTERS = np.column_stack([np.linspace(-0.9, 0.9, 13), np.zeros(13), np.zeros(13)])
+
+#: Half the edge of the cube.
+HALF_M = 0.1
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_ball_session(tmp_path_factory.mktemp("ball"), CENTERS, n_cameras=6)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    places = {"hit": (0.0, 0.0, 0.0), "far": (0.0, 0.0, 900.0)}
+    return write_cube_scene(tmp_path_factory.mktemp("cubes"), places)
+
+
+def distance_to_cube_surface_m(center: np.ndarray) -> float:
+    outside = np.linalg.norm(np.maximum(np.abs(center) - HALF_M, 0.0))
+    inside = np.maximum(HALF_M - np.abs(center), 0.0).min()
+    return float(outside if outside > 0 else inside)
+
+
+@pytest.mark.parametrize(
+    "engine", ["native", "reference", pytest.param("compute", marks=pytest.mark.gl)]
+)
+def test_every_frame_in_which_the_ball_meets_the_surface_collides(
+    run: Run, tmp_path: Path, session: Path, scene: Path, engine: str
+) -> None:
+    path = tmp_path / "report.h5"
+
+    status = run(
+        "detect", session, "--scene", scene, "-o", path, "--viewport", 40, "--engine", engine
+    )
+
+    assert status == 0
+    report = read_report(path)
+    assert report.attributes["engine"] == engine
+    hit, far = report.objects["hit"], report.objects["far"]
+    for row, center in enumerate(CENTERS):
+        # The hull of a ball contains the ball. Samples are 0.2 sqrt(2) / 39 m apart, and a pixel is
+        # 2.3 / 150 m wide: contacts shallower than both may be missed, no deeper one.
+        if distance_to_cube_surface_m(center) < BALL_RADIUS_M - 0.025:
+            assert hit.collides[row], row
+            assert hit.certificate[row] == "colliding"
+        xyz_m, triangle = read_points(path, "hit", row)
+        assert len(xyz_m) == hit.n_points[row]
+        # Collision points lie on the surface of the cube, and none is far from the ball.
+        np.testing.assert_allclose(np.abs(xyz_m).max(axis=1), HALF_M, atol=1e-6)
+        assert (np.linalg.norm(xyz_m - center, axis=1) < 1.5 * BALL_RADIUS_M).all()
+        assert (triangle < 12).all()
+    assert not hit.collides[0]
+    assert not hit.collides[-1]
+    assert not far.collides.any()
+    assert (far.certificate == "free").all()
+
+
+def test_the_engines_write_the_same_points(
+    run: Run, tmp_path: Path, session: Path, scene: Path
+) -> None:
+    found = {}
+    for engine in ("native", "reference"):
+        path = tmp_path / f"{engine}.h5"
+        assert run("detect", session, "--scene", scene, "-o", path, "--engine", engine) == 0
+        with h5py.File(path) as file:
+            points = file["hybridve/objects/hit/points"]
+            found[engine] = (points["xyz_m"][:], points["triangle"][:], points["offset"][:])
+
+    for native, reference in zip(found["native"], found["reference"], strict=True):
+        np.testing.assert_array_equal(native, reference)
+    assert len(found["native"][0]) > 0
+
+
+def test_a_finer_accuracy_takes_smaller_steps_and_says_so(
+    run: Run, tmp_path: Path, session: Path, scene: Path
+) -> None:
+    path = tmp_path / "report.h5"
+
+    assert run("detect", session, "--scene", scene, "-o", path, "--accuracy-mm", 5) == 0
+
+    about = read_report(path).objects["hit"].about
+    assert about["sample_spacing_m"] <= 0.005
+    # The longest edge is a diagonal of 0.2 sqrt(2) m: 57 steps of 5 mm, 58 samples.
+    assert about["largest_viewport"] == 58
+
+
+def test_a_range_of_frames_keeps_their_numbers(
+    run: Run, tmp_path: Path, session: Path, scene: Path
+) -> None:
+    path = tmp_path / "report.h5"
+
+    assert run("detect", session, "--scene", scene, "-o", path, "--frames", "2:11:4") == 0
+
+    report = read_report(path)
+    assert report.index.tolist() == [2, 6, 10]
+    np.testing.assert_allclose(report.time_s, np.array([2, 6, 10]) / 25)
+
+
+def test_a_damaged_picture_is_a_row_with_a_reason(run: Run, tmp_path: Path, scene: Path) -> None:
+    session = write_ball_session(tmp_path / "session", CENTERS[5:8])
+    (tmp_path / "session" / "cam2" / "1.png").write_bytes(b"torn")
+    path = tmp_path / "report.h5"
+
+    assert run("detect", session, "--scene", scene, "-o", path) == 0
+
+    report = read_report(path)
+    assert (report.reason == "").tolist() == [True, False, True]
+    assert "cam2" in report.reason[1]
+    assert "1.png" in report.reason[1]
+    assert report.objects["hit"].collides.tolist() == [True, False, True]
+
+
+def test_a_late_camera_is_read_in_step_with_the_others(
+    run: Run, tmp_path: Path, scene: Path
+) -> None:
+    session = write_ball_session(tmp_path / "session", CENTERS[2:11])
+    text = session.read_text(encoding="utf-8")
+    late = text.replace('masks = "cam3/*.png"', 'masks = "cam3/*.png"\noffset_s = 0.08')
+    for frame in (0, 1):  # cam3 began two frames after the others
+        (tmp_path / "session" / "cam3" / f"{frame}.png").unlink()
+    session.write_text(late, encoding="utf-8")
+    whole = write_ball_session(tmp_path / "whole", CENTERS[2:11])
+
+    assert run("detect", session, "--scene", scene, "-o", tmp_path / "late.h5") == 0
+    assert run("detect", whole, "--scene", scene, "-o", tmp_path / "whole.h5") == 0
+
+    late_report, report = read_report(tmp_path / "late.h5"), read_report(tmp_path / "whole.h5")
+    assert "cam3" in late_report.reason[0]
+    assert (late_report.reason[2:] == "").all()
+    np.testing.assert_array_equal(
+        late_report.objects["hit"].n_points[2:], report.objects["hit"].n_points[2:]
+    )
+    assert report.objects["hit"].n_points.sum() > 0
+
+
+def test_a_camera_that_stops_early_is_told_with_what_to_do(
+    run: Run, tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = write_ball_session(tmp_path / "session", CENTERS)
+    for frame in range(9, len(CENTERS)):
+        (tmp_path / "session" / "cam1" / f"{frame}.png").unlink()
+    path = tmp_path / "report.h5"
+
+    assert run("detect", session, "--scene", scene, "-o", path) == 1
+
+    error = capsys.readouterr().err
+    assert "camera.2.masks: 'cam1/*.png' stops after 9 frames, but camera.1 has 13" in error
+    assert "--frames 0:9" in error
+    assert run("detect", session, "--scene", scene, "-o", path, "--frames", "0:9") == 0
+    assert len(read_report(path).index) == 9
+
+
+def test_status_3_tells_of_a_clash_only_if_asked(
+    run: Run, tmp_path: Path, session: Path, scene: Path
+) -> None:
+    clash = ["detect", session, "--scene", scene, "--frames", "6"]
+    clear = ["detect", session, "--scene", scene, "--frames", "0"]
+
+    assert run(*clash, "-o", tmp_path / "a.h5") == 0
+    assert run(*clash, "-o", tmp_path / "b.h5", "--fail-on-clash") == 3
+    assert run(*clear, "-o", tmp_path / "c.h5", "--fail-on-clash") == 0
+
+
+def test_an_existing_report_is_refused_and_kept(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "report.h5"
+    path.write_text("precious", encoding="utf-8")
+
+    assert run("detect", session, "--scene", scene, "-o", path) == 1
+
+    assert "exists already" in capsys.readouterr().err
+    assert path.read_text(encoding="utf-8") == "precious"
+    assert run("detect", session, "--scene", scene, "-o", path, "--overwrite") == 0
+    assert len(read_report(path).index) == len(CENTERS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frames", "90:95"], "none of the frames 90:95"),
+        (["-o", "nowhere/report.h5"], "there is no folder"),
+        (["--accuracy-mm", "0.0001"], "needs a viewport of"),
+    ],
+)
+def test_a_problem_is_one_line_and_status_1(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    session: Path,
+    scene: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    output = [] if "-o" in arguments else ["-o", "report.h5"]
+
+    assert run("detect", session, "--scene", scene, "--no-progress", *output, *arguments) == 1
+
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("error: ")
+    assert message in error
+    assert "\n" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_rig_is_told_with_the_command_that_makes_one(
+    run: Run, tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = write_ball_session(tmp_path / "session", CENTERS[:2])
+    text = session.read_text(encoding="utf-8").replace('rig = "rig.csv"\nrig_unit = "m"\n', "")
+    session.write_text(text, encoding="utf-8")
+
+    assert run("detect", session, "--scene", scene, "-o", tmp_path / "report.h5") == 1
+
+    assert "run `hybridve calibrate" in capsys.readouterr().err
+
+
+def test_masks_of_another_size_than_the_others_are_a_row_with_a_reason(
+    run: Run, tmp_path: Path, scene: Path
+) -> None:
+    session = write_ball_session(tmp_path / "session", CENTERS[5:8])
+    cv2.imwrite(str(tmp_path / "session" / "cam0" / "2.png"), np.zeros((50, 60), np.uint8))
+
+    assert run("detect", session, "--scene", scene, "-o", tmp_path / "report.h5") == 0
+
+    report = read_report(tmp_path / "report.h5")
+    assert "60x50" in report.reason[2]
+    assert (report.reason[:2] == "").all()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["detect"],
+        ["detect", "s", "--scene", "x", "-o", "r.h5", "--frames", "x"],
+        ["detect", "s", "--scene", "x", "-o", "r.h5", "--viewport", "0"],
+        ["detect", "s", "--scene", "x", "-o", "r.h5", "--viewport", "3", "--accuracy-mm", "3"],
+        ["no-such-command"],
+    ],
+)
+def test_wrong_usage_is_status_2(run: Run, arguments: list[str]) -> None:
+    assert run(*arguments) == 2
+
+
+def test_summary_counts_what_the_report_holds(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "report.h5"
+    run("detect", session, "--scene", scene, "-o", path)
+    capsys.readouterr()
+
+    assert run("summary", path, "--json") == 0
+
+    numbers = json.loads(capsys.readouterr().out)
+    report = read_report(path)
+    by_name = {found["name"]: found for found in numbers["objects"]}
+    assert numbers["frames"] == len(CENTERS)
+    assert by_name["hit"]["frames_colliding"] == report.objects["hit"].collides.sum()
+    assert by_name["far"]["verdict"] == "free"
+    assert run("summary", path) == 0
+    text = capsys.readouterr().out
+    assert "hit" in text
+    assert "colliding" in text
+
+
+def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
+    tmp_path: Path, scene: Path, run: Run
+) -> None:
+    centers = np.tile(CENTERS, (40, 1))
+    session = write_ball_session(tmp_path / "session", centers, n_cameras=2)
+    path, whole = tmp_path / "report.h5", tmp_path / "whole.h5"
+    arguments = ["detect", str(session), "--scene", str(scene), "--engine", "reference"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hybridve.cli", *arguments, "-o", str(path), "--no-progress"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("report.h5.parts/*.npz")):
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline, "no part was finished in a minute"
+        time.sleep(0.01)
+
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=30)[1]
+
+    assert process.returncode == 130, error
+    assert "Traceback" not in error
+    assert not path.exists()
+    assert run(*arguments, "-o", path, "--resume") == 0
+    assert run(*arguments, "-o", whole) == 0
+    with h5py.File(path) as resumed, h5py.File(whole) as expected:
+        compared = 0
+        names: list[str] = []
+        expected["hybridve"].visit(names.append)
+        for name in names:
+            item = expected["hybridve"][name]
+            if isinstance(item, h5py.Dataset) and "stage_s" not in name:
+                assert (
+                    resumed["hybridve"][name][()].tobytes() == item[()].tobytes()
+                    if (item.shape)
+                    else resumed["hybridve"][name][()] == item[()]
+                ), name
+                compared += 1
+        assert compared > 10
+    assert not (tmp_path / "report.h5.parts").exists()
