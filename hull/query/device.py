@@ -1,0 +1,73 @@
+"""The one door to OpenGL: a headless context, and the shaders shipped with the package."""
+
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import moderngl
+
+from hybridve.calib.errors import DeviceError
+
+#: What the engines need: compute shaders, and double precision in them.
+_GL_VERSION = 430
+
+#: Renderers that are programs on the CPU.
+_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
+
+
+def open_device(device_index: int | None = None) -> moderngl.Context:
+    """Open a headless OpenGL 4.3 context through EGL; its owner releases it.
+
+    The context belongs to the thread that opened it: use it nowhere else, and open it after a
+    fork, never before.
+
+    Parameters
+    ----------
+    device_index : int, optional
+        Which of the machine's EGL devices to take; by default the one that EGL prefers.
+
+    Raises
+    ------
+    DeviceError
+        If there is no EGL device that offers OpenGL 4.3.
+    """
+    create: Any = moderngl.create_context  # whose stub takes each backend setting for a dict
+    settings = {} if device_index is None else {"device_index": device_index}
+    try:
+        context: moderngl.Context = create(
+            require=_GL_VERSION, standalone=True, backend="egl", **settings
+        )
+    except Exception as error:  # moderngl raises plain Exception
+        wanted = "EGL" if device_index is None else f"EGL device {device_index}"
+        raise DeviceError(
+            f"no OpenGL 4.3 through {wanted} ({error}); expected a graphics driver or software "
+            "rendering: install libegl1 and libgl1-mesa-dri "
+            "(apt-get install libegl1 libgl1-mesa-dri), or take --engine native"
+        ) from error
+    context.gc_mode = "context_gc"  # what Python drops is released by context.gc(), by the owner
+    return context
+
+
+def renderer_name(context: moderngl.Context) -> str:
+    """Return what draws, as OpenGL names it."""
+    return str(context.info["GL_RENDERER"])
+
+
+def is_software_renderer(renderer: str) -> bool:
+    """Tell whether the CPU does the work of the renderer that OpenGL names so."""
+    return any(software in renderer.lower() for software in _SOFTWARE)
+
+
+@cache
+def load_shader(name: str) -> str:
+    """Return the source of a shader in ``hull/query/shaders``."""
+    return (files("hybridve.hull.query") / "shaders" / name).read_text(encoding="utf-8")
+
+
+def compile_compute(context: moderngl.Context, name: str, *parts: str) -> moderngl.ComputeShader:
+    """Return the compute program `name`, with `parts` (other shader sources) before its body.
+
+    A shader file begins with ``#version`` and may hold one line ``// INSERT``, where the parts go.
+    """
+    source = load_shader(name).replace("// INSERT\n", "\n".join(parts) + "\n")
+    return context.compute_shader(source)
