@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from hybridve.calib.errors import ReportError
 from hybridve.hull.contact.detect import Contact
@@ -132,6 +133,34 @@ def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["resumed.h5", "whole.h5"]
 
 
+@_FEW
+@given(results=frame_results(), data=st.data())
+def test_vtk_reads_the_points_of_every_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, results: list[FrameResult], data: st.DataObject
+) -> None:
+    monkeypatch.setattr(write, "_PART_FRAMES", data.draw(st.integers(1, 4)))
+    path = tmp_path / "report.h5"
+    write_all(path, results, overwrite=True)
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    assert reader.GetNumberOfSteps() == len(results)
+
+    for result in results:
+        reader.UpdateTimeStep(result.time_s)  # as ParaView asks
+
+        shown = reader.GetOutputDataObject(0)
+        contacts = result.contacts
+        expected = [point for c in contacts for point in c.points_world.tolist()]
+        triangles = [number for c in contacts for number in c.triangle.tolist()]
+        objects = [i for i, c in enumerate(contacts) for _ in c.triangle]
+        assert [list(shown.GetPoint(i)) for i in range(shown.GetNumberOfPoints())] == expected
+        assert shown.GetNumberOfCells() == (1 if expected else 0)
+        for name, values in (("triangle", triangles), ("object", objects)):
+            array = shown.GetPointData().GetArray(name)
+            assert [array.GetValue(i) for i in range(array.GetNumberOfValues())] == values
+
+
 def one_result() -> list[FrameResult]:
     contact = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
     return [FrameResult(0, 0.0, "", (contact, contact), dict.fromkeys(STAGES, 0.0))]
@@ -211,7 +240,7 @@ def test_every_dataset_says_its_unit_and_meaning_and_is_checked(report: Path) ->
                 assert item.fletcher32, name
 
     with h5py.File(report) as file:
-        file.visititems(check)
+        file["hybridve"].visititems(check)
         assert dict(file.attrs)["format"] == "hybridve-report"
         assert file.attrs["version"] == 1
 
