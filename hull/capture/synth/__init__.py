@@ -1,0 +1,24 @@
+"""Recordings with known truth, made by code.
+
+A preset says what there is: cameras around a room, a chessboard, real things in motion, CAD parts
+among them. From it come the files a real session has (stills of the board, the board on the floor,
+the empty room, the task; rendered through the true lens, with noise, flicker and soft shadows), and
+truth.h5, which says of every frame what the real shapes touched, how deep, how near, and which
+pixels show them.
+"""
+
+from hybridve.hull.capture.synth.presets import BOXES_PASSING_CLEARANCE_M, PRESETS
+from hybridve.hull.capture.synth.stage import Preset
+from hybridve.hull.capture.synth.truth import ObjectTruth, Truth, read_truth, true_masks
+from hybridve.hull.capture.synth.write import write_session
+
+__all__ = [
+    "BOXES_PASSING_CLEARANCE_M",
+    "PRESETS",
+    "ObjectTruth",
+    "Preset",
+    "Truth",
+    "read_truth",
+    "true_masks",
+    "write_session",
+]

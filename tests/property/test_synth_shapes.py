@@ -1,0 +1,181 @@
+"""Shapes in closed form, and how near they come to a surface."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hybridve.calib.pose import Pose, rotation_about_axes, transform
+from hybridve.hull.capture.synth.closest import TOLERANCE_M, closest_on_surface
+from hybridve.hull.capture.synth.meshes import box_mesh
+from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Shape
+
+ROUNDING_M = 1e-12  # float64 at coordinates of a metre, with room for a few operations
+
+sizes = st.floats(0.01, 0.3)
+shapes = st.one_of(
+    st.builds(Ball, sizes), st.builds(Capsule, sizes, sizes), st.builds(Box, sizes, sizes, sizes)
+)
+coordinates = st.floats(-1.0, 1.0, allow_subnormal=False)
+points = st.tuples(coordinates, coordinates, coordinates).map(np.array)
+angles_deg = st.floats(-180.0, 180.0)
+poses = st.builds(
+    lambda angles, position: np.column_stack([rotation_about_axes(angles), position]),
+    st.tuples(angles_deg, angles_deg, angles_deg),
+    points,
+)
+
+
+def distance(shape: Shape, point: NDArray[np.float64]) -> float:
+    return float(shape.signed_distance(point[None])[0][0])
+
+
+@given(shape=shapes, first=points, second=points)
+def test_a_step_changes_the_distance_by_no_more_than_its_length(
+    shape: Shape, first: NDArray[np.float64], second: NDArray[np.float64]
+) -> None:
+    step_m = float(np.linalg.norm(second - first))
+
+    change_m = abs(distance(shape, second) - distance(shape, first))
+
+    assert change_m <= step_m + ROUNDING_M
+
+
+@given(shape=shapes, first=points, second=points)
+def test_the_distance_lies_above_its_tangents(
+    shape: Shape, first: NDArray[np.float64], second: NDArray[np.float64]
+) -> None:
+    at_first, slope = shape.signed_distance(first[None])
+
+    tangent = float(at_first[0] + slope[0] @ (second - first))
+
+    assert distance(shape, second) >= tangent - ROUNDING_M
+
+
+@given(radius_m=sizes, point=points)
+def test_distance_of_a_ball_is_that_of_its_centre_less_its_radius(
+    radius_m: float, point: NDArray[np.float64]
+) -> None:
+    expected = np.sqrt(point[0] ** 2 + point[1] ** 2 + point[2] ** 2) - radius_m
+
+    assert distance(Ball(radius_m), point) == pytest.approx(expected, abs=ROUNDING_M)
+
+
+@given(half_length_m=sizes, radius_m=sizes, point=points)
+def test_a_capsule_is_as_near_as_the_nearest_of_the_balls_it_consists_of(
+    half_length_m: float, radius_m: float, point: NDArray[np.float64]
+) -> None:
+    along = np.linspace(-half_length_m, half_length_m, 2001)
+    spacing_m = along[1] - along[0]
+    balls = np.sqrt(point[0] ** 2 + point[1] ** 2 + (point[2] - along) ** 2) - radius_m
+
+    found = distance(Capsule(half_length_m, radius_m), point)
+
+    assert balls.min() - spacing_m / 2 <= found <= balls.min() + ROUNDING_M
+
+
+@given(half=st.tuples(sizes, sizes, sizes), point=points)
+def test_distance_of_a_box_is_that_to_its_nearest_surface_point(
+    half: tuple[float, float, float], point: NDArray[np.float64]
+) -> None:
+    nearest = np.clip(point, -np.array(half), half)
+    if np.array_equal(nearest, point):  # inside: straight to the nearest of six faces
+        expected = -min(h - abs(p) for h, p in zip(half, point, strict=True))
+    else:
+        expected = float(np.linalg.norm(point - nearest))
+
+    assert distance(Box(*half), point) == pytest.approx(expected, abs=ROUNDING_M)
+
+
+@given(shape=shapes, origin=points, toward=points)
+def test_a_ray_enters_where_the_distance_first_vanishes(
+    shape: Shape, origin: NDArray[np.float64], toward: NDArray[np.float64]
+) -> None:
+    assume(distance(shape, origin) > 0.01)
+    direction = 0.4 * toward - origin  # many hit, some miss
+    length_m = float(np.linalg.norm(direction))
+    assume(length_m > 0.1)
+
+    entry = float(shape.hit(origin, direction[None])[0])
+
+    # A walk that never steps over the surface: each step is as long as the way is free.
+    along, free_m = 0.0, distance(shape, origin)
+    for _ in range(400):
+        along += free_m / length_m
+        free_m = distance(shape, origin + along * direction)
+        if free_m < 1e-7 or along > 30.0:
+            break
+    if free_m >= 1e-7 and along > 30.0:
+        assert entry == np.inf
+    elif np.isfinite(entry):
+        assert abs(distance(shape, origin + entry * direction)) < 1e-7
+        assert along <= entry + 1e-7 / length_m
+    else:  # a ray that grazes: the walk comes within its own resolution and no further
+        ahead = along + np.linspace(0.0, 1.0, 2001)
+        rest = origin + ahead[:, None] * direction
+        assert shape.signed_distance(rest)[0].min() > -1e-6
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    corners=st.lists(points, min_size=3, max_size=9),
+    first=st.tuples(shapes, poses),
+    second=st.tuples(shapes, poses),
+)
+def test_the_closest_point_agrees_with_dense_samples_of_the_surface(
+    corners: list[NDArray[np.float64]], first: tuple[Shape, Pose], second: tuple[Shape, Pose]
+) -> None:
+    triangles = np.array([corners[i : i + 3] for i in range(len(corners) - 2)])
+    steps = 60
+    i, j = (k.ravel() for k in np.mgrid[: steps + 1, : steps + 1])
+    keep = i + j <= steps
+    u, v = (k[keep][:, None] / steps for k in (i, j))
+    a, b, c = (triangles[:, None, k] for k in range(3))
+    samples = (a + (b - a) * u + (c - a) * v).reshape(-1, 3)
+    edges = triangles - np.roll(triangles, 1, axis=1)
+    spacing_m = np.linalg.norm(edges, axis=2).max() / steps
+    sampled = np.inf
+    for shape, world_from_shape in (first, second):
+        local = (samples - world_from_shape[:, 3]) @ world_from_shape[:, :3]
+        sampled = min(sampled, float(shape.signed_distance(local)[0].min()))
+
+    found = closest_on_surface(triangles, (first[0], second[0]), (first[1], second[1]))
+
+    # Samples lie at most a spacing from any point of the surface, and distances are 1-Lipschitz.
+    assert sampled - spacing_m <= found.distance_m <= sampled + TOLERANCE_M
+    shape, world_from_shape = (first, second)[found.shape]
+    local = (found.point_world - world_from_shape[:, 3]) @ world_from_shape[:, :3]
+    assert distance(shape, local) == pytest.approx(found.distance_m, abs=10 * ROUNDING_M)
+
+
+@given(half=st.tuples(sizes, sizes, sizes), center=points, radius_m=sizes, world_from_mesh=poses)
+def test_a_ball_outside_a_box_of_triangles_is_as_far_as_outside_the_box(
+    half: tuple[float, float, float],
+    center: NDArray[np.float64],
+    radius_m: float,
+    world_from_mesh: Pose,
+) -> None:
+    size_mm = (2000 * half[0], 2000 * half[1], 2000 * half[2])
+    surface = box_mesh(size_mm, 150.0).triangles_mm / 1000.0
+    outside_m = float(np.linalg.norm(center - np.clip(center, -np.array(half), half)))
+    assume(outside_m > 0)
+    triangles = transform(world_from_mesh, surface.reshape(-1, 3)).reshape(-1, 3, 3)
+    center_world = transform(world_from_mesh, center[None])[0]
+    world_from_ball = np.column_stack([np.eye(3), center_world])
+
+    found = closest_on_surface(triangles, (Ball(radius_m),), (world_from_ball,))
+
+    excess_m = found.distance_m - (outside_m - radius_m)
+    assert -10 * ROUNDING_M <= excess_m <= TOLERANCE_M + 10 * ROUNDING_M
+
+
+@given(gap_m=st.floats(-0.02, 0.2), shift_m=st.floats(-0.03, 0.03))
+def test_parallel_faces_are_as_far_apart_as_they_are(gap_m: float, shift_m: float) -> None:
+    # The whole face is nearest: the worst case for a search that drops what is farther.
+    surface = box_mesh((200.0, 200.0, 200.0), 50.0).triangles_mm / 1000.0
+    pose = np.column_stack([np.eye(3), [0.1 + gap_m + 0.05, shift_m, 0.0]])
+
+    found = closest_on_surface(surface, (Box(0.05, 0.05, 0.05),), (pose,))
+
+    assert abs(found.distance_m - gap_m) <= TOLERANCE_M + ROUNDING_M
