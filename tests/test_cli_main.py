@@ -1,0 +1,110 @@
+"""The command line as a whole: help, documentation, errors, and how it leaves."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import pytest
+
+from hybridve.calib.errors import HybridveError
+from hybridve.cli.main import cli
+
+README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", list(cli.commands))
+def test_every_command_is_in_the_readme_and_its_help_tells_what_it_does(name: str) -> None:
+    command = cli.commands[name]
+
+    assert f"`hybridve {name}" in README
+    assert command.help
+    assert command.short_help
+    if any(isinstance(parameter, click.Argument) for parameter in command.params):
+        assert f"hybridve {name} " in command.help.split("Example:")[1]
+
+
+@pytest.mark.parametrize("name", list(cli.commands))
+def test_every_option_is_explained(name: str) -> None:
+    for parameter in cli.commands[name].params:
+        if isinstance(parameter, click.Option):
+            assert parameter.help, parameter.name
+
+
+@pytest.mark.parametrize("name", ["-o", "--overwrite", "--frames", "--engine", "--scene"])
+def test_the_same_option_means_the_same_everywhere(name: str) -> None:
+    kinds = {
+        type(parameter.type)
+        for command in cli.commands.values()
+        for parameter in command.params
+        if isinstance(parameter, click.Option) and name in parameter.opts
+    }
+
+    assert len(kinds) == 1
+
+
+def test_help_loads_no_heavy_library() -> None:
+    code = (
+        "import sys\nsys.argv = ['hybridve', '--help']\n"
+        "from hybridve.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "print([n for n in ('numpy', 'cv2', 'h5py', 'open3d', 'pycolmap', 'numba', 'pydantic')"
+        " if n in sys.modules])"
+    )
+
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert shown.stdout.strip().endswith("[]")
+    assert "detect" in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "text"),
+    [
+        (HybridveError("rig.json: camera 'left': broken"), 1, "error: rig.json: camera 'left'"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (click.UsageError("give one of both"), 2, "give one of both"),
+    ],
+)
+def test_errors_become_one_line_and_a_status(
+    run: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException,
+    status: int,
+    text: str,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli.commands["doctor"], "callback", fail)
+
+    assert run("doctor") == status
+
+    shown = capsys.readouterr()
+    assert text in shown.err
+    assert shown.out == ""
+    assert "Traceback" not in shown.err
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    code = (
+        "import click, sys\nfrom hybridve.cli.main import cli, main\n"
+        "cli.commands['doctor'].callback = lambda **_: [click.echo('x' * 80) for _ in range(10**5)]\n"
+        "sys.argv = ['hybridve', 'doctor']\nmain()"
+    )
+    command = f'{sys.executable} -c "$CODE" | head -1; exit ${{PIPESTATUS[0]}}'
+
+    done = subprocess.run(
+        ["bash", "-c", command],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "CODE": code},
+    )
+
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert done.stdout == "x" * 80 + "\n"

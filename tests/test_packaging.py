@@ -1,0 +1,56 @@
+"""What is shipped: the wheel holds the package, its shaders and nothing else."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def wheel_names(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    folder = tmp_path_factory.mktemp("wheel")
+    # From a copy: setuptools keeps what it built before in the folder it builds from.
+    checkout = folder / "checkout"
+    checkout.mkdir()
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=PROJECT,
+        capture_output=True,
+        check=True,
+    ).stdout.split(b"\0")
+    for name in (part.decode() for part in listed if part):
+        if (PROJECT / name).is_file():
+            (checkout / name).parent.mkdir(parents=True, exist_ok=True)
+            (checkout / name).write_bytes((PROJECT / name).read_bytes())
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps"]
+    command += ["--no-build-isolation", "--wheel-dir", str(folder), str(checkout)]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,) = folder.glob("hybridve-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        return archive.namelist()
+
+
+def test_the_wheel_holds_the_package_and_nothing_beside_it(wheel_names: list[str]) -> None:
+    tops = {name.split("/")[0] for name in wheel_names}
+
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"hybridve"}
+
+
+def test_every_source_file_and_shader_is_in_the_wheel(wheel_names: list[str]) -> None:
+    for folder in ("cli", "hull", "calib"):
+        for pattern in ("*.py", "*.glsl", "py.typed"):
+            for path in (PROJECT / folder).rglob(pattern):
+                name = f"hybridve/{path.relative_to(PROJECT).as_posix()}"
+                assert name in wheel_names, f"{name} is missing: list it in pyproject.toml"
+
+
+def test_a_plain_import_of_the_folders_fails() -> None:
+    code = "import importlib.util as u, sys; sys.exit(u.find_spec('hull') is not None)"
+
+    done = subprocess.run([sys.executable, "-c", code], cwd="/", check=False)
+
+    assert done.returncode == 0
