@@ -1,7 +1,6 @@
 """The command ``hybridve``: its sub-commands, and the one place where errors become text."""
 
 import logging
-import os
 import sys
 from importlib.metadata import version
 from typing import NoReturn
@@ -71,9 +70,6 @@ def main() -> NoReturn:
     except (KeyboardInterrupt, click.Abort):
         click.echo("interrupted", err=True)
         sys.exit(_INTERRUPTED)
-    except BrokenPipeError:  # the reader of stdout, head for example, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     sys.exit(0)
