@@ -23,7 +23,7 @@ from hybridve.hull.capture.synth import (
     write_session,
 )
 from hybridve.hull.capture.synth.meshes import Mesh, box_mesh, bracket_mesh, write_stl
-from hybridve.hull.capture.synth.render import shadow_map
+from hybridve.hull.capture.synth.render import make_view, shadow_lookup, shadow_map
 from hybridve.hull.capture.synth.shapes import Ball
 from hybridve.hull.capture.synth.stage import Lamp
 from hybridve.hull.contact.scene import Scene, load_scene
@@ -195,6 +195,23 @@ def test_the_shadow_of_a_ball_lies_in_line_with_the_lamp_and_is_soft() -> None:
     # Between circles of 0.20 m -+ a lamp of 0.20 m seen from three times as far.
     ring = np.pi * ((0.2 + 0.0667) ** 2 - (0.2 - 0.0667) ** 2)
     assert 0.6 * ring < penumbra < 1.1 * ring
+
+
+def test_shadows_lie_on_the_floor_where_cameras_see_it() -> None:
+    stage = PRESETS["boxes"].make_stage()
+    x, y = np.meshgrid(np.linspace(-0.3, 0.9, 9), np.linspace(-0.3, 0.7, 9))
+    on_floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    pixel_m = 0.01
+    expected = (on_floor[:, :2] - stage.room.center_world + 2.0) / pixel_m - 0.5
+    for camera in stage.cameras:
+        pixels, _ = project_points(camera, on_floor)
+
+        lookup = shadow_lookup(make_view(camera), stage.room)
+
+        places = (pixels - 0.5).astype(np.float32)[:, None]  # OpenCV's convention
+        found = [cv2.remap(part, places, None, cv2.INTER_LINEAR)[:, 0] for part in lookup]
+        # Remap interpolates at 1/32 pixel, and a pixel is up to two texels long on the floor.
+        np.testing.assert_allclose(np.stack(found, axis=1), expected, atol=0.1)
 
 
 def test_objects_behave_as_the_preset_says(truth: Truth) -> None:

@@ -104,6 +104,7 @@ def silhouette_size(camera: int) -> np.ndarray:
     return np.array([view(camera).camera.width_px, view(camera).camera.height_px])
 
 
+@settings(deadline=None)
 @given(camera=st.integers(0, 3))
 def test_nothing_is_seen_behind_the_camera(camera: int) -> None:
     from_cam = view(camera).camera

@@ -290,7 +290,8 @@ def hold_board(
         tilt_deg = rng.uniform(12.0, 40.0)
         about = rng.uniform(0.0, 2.0 * np.pi)
         roll_deg = rng.uniform(-12.0, 12.0) + (90.0 if index % 7 == 5 else 0.0)
-        distance_m = rng.uniform(1.15, 2.0)
+        # Far away it fits into a corner; near, it fills the image.
+        distance_m = rng.uniform(1.1, 1.6) + 0.3 * np.abs(toward).sum()
         lean = (
             rotation_about_axes((0.0, 0.0, np.rad2deg(about)))
             @ rotation_about_axes((tilt_deg, 0.0, 0.0))
