@@ -1,0 +1,251 @@
+"""The engine in OpenGL compute shaders: its precision, its buffers, its manners on the device."""
+
+import gc
+from collections.abc import Iterator
+
+import moderngl
+import numpy as np
+import pytest
+from helpers.hulls import (
+    EDGE_BAND_PX,
+    ball_hull,
+    differences,
+    is_in_order,
+    look_at,
+    near_pixel_edge,
+    projection,
+    ring_views,
+    soup,
+    sphere_mesh,
+)
+
+from hybridve.calib.errors import DeviceError
+from hybridve.hull.query import compute as compute_module
+from hybridve.hull.query import device as device_module
+from hybridve.hull.query.bounds import FREE, verdicts
+from hybridve.hull.query.compute import Compute
+from hybridve.hull.query.device import open_device
+from hybridve.hull.query.engine import Triangles
+from hybridve.hull.query.native import Native
+from hybridve.hull.query.silhouettes import Views, make_hull, make_views
+from hybridve.hull.query.viewport import sample_positions
+
+pytestmark = pytest.mark.gl
+
+native = Native(n_threads=1)
+
+
+@pytest.fixture(scope="module")
+def context() -> Iterator[moderngl.Context]:
+    context = open_device()
+    yield context
+    context.release()
+
+
+@pytest.fixture
+def compute(context: moderngl.Context) -> Iterator[Compute]:
+    """The engine, on a device that is clean before the test and must be clean after it."""
+    assert context.error == "GL_NO_ERROR"
+    with Compute(context) as engine:
+        yield engine
+    assert context.error == "GL_NO_ERROR"
+
+
+def large_views(rng: np.random.Generator) -> Views:
+    """Four cameras of 1600 x 1200, 2 to 10 m away, focal lengths from wide to long."""
+    matrices = []
+    for focal_px in (500.0, 1000.0, 2000.0, 3000.0):
+        direction = rng.normal(size=3)
+        center = direction / np.linalg.norm(direction) * rng.uniform(2.0, 10.0)
+        pose = look_at(center, np.zeros(3), rng.uniform(0, 6.0))
+        matrices.append(projection(pose, focal_px, 1600, 1200))
+    return make_views(tuple("abcd"), np.array([[1600, 1200]] * 4), np.array(matrices))
+
+
+# The largest triangles span the image and more: float32 about a vertex would not do for them.
+@pytest.mark.parametrize("extent_m", [0.003, 0.05, 0.3, 1.5, 6.0])
+def test_a_large_image_is_sampled_to_a_thousandth_of_a_pixel(
+    compute: Compute, extent_m: float
+) -> None:
+    rng = np.random.default_rng(1)
+    views = large_views(rng)
+    # In noise that differs from pixel to pixel nearly every wrong pixel shows.
+    hull = make_hull(views, [rng.integers(0, 5, (1200, 1600)).astype(np.uint8) for _ in range(4)])
+    n_triangles = 400 if extent_m < 1.0 else 4000
+    corners = rng.normal(size=(n_triangles, 1, 3)) * 0.2
+    corners = corners + rng.normal(size=(n_triangles, 3, 3)) * extent_m
+    mesh = soup(views, corners, np.full(n_triangles, 40, np.int32))
+
+    (found,), (expected,) = compute.query(hull, [mesh]), native.query(hull, [mesh])
+
+    difference = differences(views, mesh, found, expected, EDGE_BAND_PX)
+    assert difference.outside_band == []
+    assert len(expected) > 10_000, "the test would prove too little"
+    samples = np.tile(np.arange(820, dtype=np.uint32), 100)
+    viewports = np.full(len(samples), 40, np.int32)
+    positions = sample_positions(np.repeat(corners[:100], 820, axis=0), viewports, samples)
+    # Two coordinates in each of four cameras, a band on either side of each edge: 1.6 %.
+    assert near_pixel_edge(views, positions, EDGE_BAND_PX).mean() < 0.02
+
+
+def test_a_triangle_seen_on_edge_beside_a_pixel_edge_is_not_rejected(compute: Compute) -> None:
+    """The rectangle of such a triangle has no width: without its pad, rounding would move it."""
+    rng = np.random.default_rng(2)
+    n_triangles, column = 300, 801
+    pose = look_at(np.array([3.0, 1.0, 2.0]), np.array([0.1, 0.2, 0.3]), 0.4)
+    matrix = projection(pose, 1700.0, 1600, 1200)
+    views = make_views(("cam",), np.array([[1600, 1200]]), matrix[None])
+    mask = np.zeros((1200, 1600), np.uint8)
+    mask[:, column] = 1
+    hull = make_hull(views, [mask])
+    # All samples fall twice the band inside the only object column, to either side of it.
+    inside_px = np.where(rng.random(n_triangles) < 0.5, 2e-3, 1.0 - 2e-3)
+    pixels = np.stack(
+        [
+            np.repeat(column + inside_px, 3).reshape(-1, 3),
+            rng.uniform(50, 1150, (n_triangles, 3)),
+            np.ones((n_triangles, 3)),
+        ],
+        axis=-1,
+    )
+    depths_m = rng.uniform(1.0, 8.0, (n_triangles, 3, 1))
+    local = views.img_from_local[0]
+    corners = (pixels * depths_m - local[:, 3]) @ np.linalg.inv(local[:, :3]).T
+    mesh = soup(views, corners, np.full(n_triangles, 10, np.int32))
+
+    (hits,) = compute.query(hull, [mesh])
+
+    assert len(hits) == n_triangles * 55
+
+
+def test_only_what_rectangles_leave_open_is_sampled(compute: Compute) -> None:
+    views = ring_views()
+    hull = ball_hull(views, np.array([0.5, 0.0, 0.0]), 0.13)
+    mesh = sphere_mesh(20_000)
+    n_open = int((verdicts(hull, mesh.corners_world - views.origin_world) != FREE).sum())
+
+    compute.query(hull, [mesh])
+
+    n_items = int(np.frombuffer(compute._counters.read(), np.uint32)[3])
+    assert n_open <= n_items
+    assert n_items - n_open <= 0.01 * n_open  # what the wider pad of single precision costs
+
+
+def test_meshes_are_told_apart(compute: Compute) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    nothing = Triangles(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
+    far = sphere_mesh(100, center_world=(2.0, 0.0, 0.0))
+    meshes = [sphere_mesh(100, 0.1), nothing, far, sphere_mesh(500, 0.19, viewport=7), nothing]
+
+    found, expected = compute.query(hull, meshes), native.query(hull, meshes)
+
+    assert [len(hits) for hits in found] == [len(hits) for hits in expected]
+    assert [len(hits) > 0 for hits in found] == [True, False, False, True, False]
+    for mesh, hits, expected_hits in zip(meshes, found, expected, strict=True):
+        assert is_in_order(mesh, hits)
+        np.testing.assert_array_equal(hits.sample, expected_hits.sample)
+        np.testing.assert_array_equal(hits.triangle, expected_hits.triangle)
+        assert hits.triangle.dtype == hits.sample.dtype == np.uint32
+
+
+def test_no_meshes_is_no_hits(compute: Compute) -> None:
+    assert compute.query(ball_hull(ring_views(), np.zeros(3), 0.2), []) == []
+
+
+def test_buffers_grow_when_a_frame_overflows_them(
+    context: moderngl.Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compute_module, "_FIRST_SIZE", 64)
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    mesh = sphere_mesh(300, 0.1, viewport=70)
+    with Compute(context) as engine:
+        (found,) = engine.query(hull, [mesh])
+
+    (expected,) = native.query(hull, [mesh])
+    np.testing.assert_array_equal(found.sample, expected.sample)
+    assert len(found) == len(mesh) * 70 * 71 // 2  # all of it is inside
+
+
+def test_a_frame_too_large_for_the_device_is_asked_in_parts(context: moderngl.Context) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    meshes = [sphere_mesh(300, 0.1, viewport=20), sphere_mesh(200, 0.15, viewport=12)]
+    with Compute(context) as engine:
+        engine._largest = 1 << 15  # as if the device held no larger buffer
+        uploads = engine._upload
+        engine._upload = lambda array, what: engine._context.buffer(np.ascontiguousarray(array))
+        found = engine.query(hull, meshes)
+        engine._upload = uploads
+
+    for hits, expected in zip(found, native.query(hull, meshes), strict=True):
+        np.testing.assert_array_equal(hits.triangle, expected.triangle)
+        np.testing.assert_array_equal(hits.sample, expected.sample)
+
+
+def test_a_triangle_too_large_for_the_device_is_named(context: moderngl.Context) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    mesh = Triangles(
+        np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]),
+        np.array([[0, 1, 2]], np.int32),
+        np.array([100], np.int32),
+    )
+    with Compute(context) as engine:
+        hull_fits = engine.query(hull, [mesh])
+        engine._largest = 1 << 12
+        engine._hits = engine._reserve(64)
+        with pytest.raises(DeviceError, match=r"triangle 0 has 5050 samples .* native"):
+            engine.query(hull, [mesh])
+    assert len(hull_fits[0]) == 5050
+
+
+def test_samples_that_32_bits_cannot_count_are_asked_in_batches() -> None:
+    before = np.cumsum([0, *[3 << 29] * 3, 1 << 28, 1 << 28, 1 << 28])
+    uploaded = [type("Uploaded", (), {"samples_before": before})()] * 2
+
+    batches = compute_module._batches(uploaded, [range(6), range(6)])
+
+    samples = [sum(int(before[x.stop] - before[x.start]) for x in batch) for batch in batches]
+    assert max(samples) <= 1 << 31
+    covered = [(x.mesh, t) for batch in batches for x in batch for t in range(x.start, x.stop)]
+    assert covered == [(mesh, t) for mesh in range(2) for t in range(6)]
+
+
+def test_what_belonged_to_a_mesh_leaves_the_device_with_it(compute: Compute) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    kept = sphere_mesh(100)
+    compute.query(hull, [kept, sphere_mesh(200)])
+    gc.collect()
+
+    compute.query(hull, [kept])
+
+    assert list(compute._meshes) == [kept]
+
+
+def test_the_same_engine_serves_other_cameras(compute: Compute) -> None:
+    mesh = sphere_mesh(2000, 0.2, viewport=5)
+    for n_cameras in (2, 9, 4, 17):
+        for center in ([0.2, 0.0, 0.0], [0.0, 0.1, 0.1]):
+            hull = ball_hull(ring_views(n_cameras, 200, 150, 200.0), np.array(center), 0.15)
+
+            (found,), (expected,) = compute.query(hull, [mesh]), native.query(hull, [mesh])
+
+            difference = differences(hull.views, mesh, found, expected, EDGE_BAND_PX)
+            assert difference.outside_band == []
+            assert len(expected) > 0
+
+
+def test_without_opengl_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_library(**settings: object) -> None:
+        raise Exception("libEGL.so not loaded")
+
+    monkeypatch.setattr(device_module.moderngl, "create_context", no_library)
+
+    with pytest.raises(DeviceError, match=r"libEGL.so not loaded.*libegl1.*libgl1-mesa-dri"):
+        Compute()
+
+
+def test_closing_twice_is_harmless(context: moderngl.Context) -> None:
+    engine = Compute(context)
+    engine.close()
+    engine.close()
+
+    assert context.error == "GL_NO_ERROR"

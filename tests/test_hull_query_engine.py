@@ -1,0 +1,122 @@
+"""Meshes as engines take them, and which engine serves."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from hybridve.calib.errors import DeviceError
+from hybridve.hull.query import compute as compute_module
+from hybridve.hull.query.choose import open_engine
+from hybridve.hull.query.engine import Triangles
+
+VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+VIEWPORTS = np.array([10, 4], np.int32)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("vertices_world", VERTICES * [1, np.nan, 1], r"vertex 0 is not finite"),
+        ("vertices_world", np.where(VERTICES == 1, -np.inf, VERTICES), r"vertex 1 is not finite"),
+        ("vertices_world", np.zeros((4, 2)), r"vertices_world has shape \(4, 2\), expected"),
+        (
+            "faces",
+            FACES + np.array([[0], [1]]),
+            r"triangle 1 has vertices \[1, 3, 4\], expected numbers below 4",
+        ),
+        ("faces", FACES - 1, r"triangle 0 has vertices \[-1, 0, 1\]"),
+        ("faces", FACES.astype(np.int64) + 2**32, r"faces holds a number that does not fit int32"),
+        ("faces", FACES[0], r"faces has shape \(3,\), expected \(N, 3\)"),
+        ("viewports", VIEWPORTS[:1], r"1 viewports for 2 triangles"),
+        ("viewports", VIEWPORTS - 4, r"triangle 1 has viewport 0, expected 1\.\.65535"),
+        ("viewports", VIEWPORTS * 10_000, r"triangle 0 has viewport 100000"),
+    ],
+)
+def test_a_mesh_that_cannot_be_sampled_is_refused_by_name(
+    field: str, value: np.ndarray, message: str
+) -> None:
+    fields = {"vertices_world": VERTICES, "faces": FACES, "viewports": VIEWPORTS, field: value}
+
+    with pytest.raises(ValueError, match=message):
+        Triangles(**fields)
+
+
+def test_a_mesh_with_coordinates_whose_sum_overflows_is_taken() -> None:
+    assert len(Triangles(VERTICES * 1e308, FACES, VIEWPORTS)) == 2
+
+
+def test_an_empty_mesh_is_a_mesh() -> None:
+    assert len(Triangles(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))) == 0
+
+
+def test_a_mesh_does_not_change_with_the_arrays_it_was_made_from() -> None:
+    vertices, faces = VERTICES.copy(), FACES.astype(np.int64)
+    mesh = Triangles(vertices, faces, VIEWPORTS)
+
+    vertices[:] = 7.0
+    faces[:] = 0
+
+    np.testing.assert_array_equal(mesh.vertices_world, VERTICES)
+    np.testing.assert_array_equal(mesh.faces, FACES)
+    with pytest.raises(ValueError, match="read-only"):
+        mesh.vertices_world[0] = 1.0
+
+
+def test_a_moved_mesh_shares_its_faces() -> None:
+    mesh = Triangles(VERTICES, FACES, VIEWPORTS)
+
+    moved = dataclasses.replace(mesh, vertices_world=VERTICES + 1.0)
+
+    assert moved.faces is mesh.faces
+    assert moved.viewports is mesh.viewports
+    np.testing.assert_array_equal(moved.corners_world, mesh.corners_world + 1.0)
+
+
+@pytest.mark.parametrize(
+    "name", ["reference", "native", pytest.param("compute", marks=pytest.mark.gl)]
+)
+def test_an_engine_is_opened_by_name(name: str) -> None:
+    with open_engine(name) as engine:
+        assert engine.name == name
+        assert engine.renderer
+
+
+def test_an_unknown_engine_is_refused() -> None:
+    with pytest.raises(ValueError, match="engine 'warp', expected auto, compute"):
+        open_engine("warp")
+
+
+class FakeCompute:
+    name = "compute"
+    renderer = "NVIDIA H100"
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def test_auto_takes_opengl_on_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compute_module, "Compute", FakeCompute)
+
+    assert open_engine("auto").name == "compute"
+
+
+def test_auto_takes_native_where_opengl_is_software(monkeypatch: pytest.MonkeyPatch) -> None:
+    software = FakeCompute()
+    software.renderer = "llvmpipe (LLVM 15.0.6, 256 bits)"
+    monkeypatch.setattr(compute_module, "Compute", lambda: software)
+
+    assert open_engine("auto").name == "native"
+    assert software.is_closed
+
+
+def test_auto_takes_native_without_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing() -> None:
+        raise DeviceError("no OpenGL")
+
+    monkeypatch.setattr(compute_module, "Compute", missing)
+
+    assert open_engine("auto").name == "native"
+    with pytest.raises(DeviceError):
+        open_engine("compute")

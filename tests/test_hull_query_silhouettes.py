@@ -1,0 +1,118 @@
+"""Cameras and silhouettes as the engines take them."""
+
+import numpy as np
+import pytest
+from helpers.hulls import look_at, projection, ring_views
+
+from hybridve.hull.query.silhouettes import make_hull, make_views
+
+
+def ring_matrices(n_cameras: int, target: np.ndarray, distance_m: float = 3.0) -> np.ndarray:
+    angles = 2 * np.pi * np.arange(n_cameras) / n_cameras
+    around = np.stack([np.cos(angles), np.sin(angles), np.full(n_cameras, 0.4)], axis=-1)
+    return np.array(
+        [
+            projection(look_at(target + distance_m * offset, target), 500.0, 640, 480)
+            for offset in around
+        ]
+    )
+
+
+SIZES = np.array([[640, 480]] * 3)
+NAMES = ("a", "b", "c")
+
+
+def test_the_local_origin_is_where_the_optical_axes_meet() -> None:
+    target = np.array([1234.0, -56.0, 7.0])
+
+    views = make_views(NAMES, SIZES, ring_matrices(3, target))
+
+    # Rounded to centimetres.
+    np.testing.assert_allclose(views.origin_world, target, atol=0.005)
+
+
+def test_parallel_axes_have_a_local_origin_among_the_cameras() -> None:
+    target = np.array([100.0, 200.0, 0.0])
+    matrices = np.array(
+        [
+            projection(
+                look_at(target + np.array([x, 0, 5.0]), target + np.array([x, 0, 0])),
+                500.0,
+                640,
+                480,
+            )
+            for x in (-1.0, 0.0, 1.0)
+        ]
+    )
+
+    views = make_views(NAMES, SIZES, matrices)
+
+    np.testing.assert_allclose(views.origin_world, target + np.array([0, 0, 5.0]), atol=0.005)
+
+
+def test_one_camera_has_a_local_origin() -> None:
+    target = np.array([100.0, 200.0, 0.0])
+
+    views = make_views(("a",), SIZES[:1], ring_matrices(1, target))
+
+    assert np.linalg.norm(views.origin_world - target) < 5.0  # metres: at the camera
+
+
+def test_points_project_alike_in_the_world_and_locally() -> None:
+    matrices = ring_matrices(3, np.array([1.0, 2.0, 3.0]))
+    points_world = np.random.default_rng(0).normal(size=(20, 3)) + np.array([1.0, 2.0, 3.0])
+    scales = np.array([0.01, 1.0, 100.0])[:, None, None]
+
+    views = make_views(NAMES, SIZES, matrices * scales)
+
+    world = np.einsum("cij,nj->cni", matrices[:, :, :3], points_world) + matrices[:, None, :, 3]
+    local = (
+        np.einsum("cij,nj->cni", views.img_from_local[:, :, :3], points_world - views.origin_world)
+        + views.img_from_local[:, None, :, 3]
+    )
+    np.testing.assert_allclose(local[..., :2] / local[..., 2:], world[..., :2] / world[..., 2:])
+    # The third coordinate is the depth in metres, whatever the scale of the matrix.
+    np.testing.assert_allclose(local[..., 2], world[..., 2])
+
+
+@pytest.mark.parametrize("min_cameras", [0, 4])
+def test_more_cameras_than_there_are_cannot_be_needed(min_cameras: int) -> None:
+    with pytest.raises(ValueError, match=rf"min_cameras is {min_cameras}, expected 1\.\.3"):
+        make_views(NAMES, SIZES, ring_matrices(3, np.zeros(3)), "keep", min_cameras)
+
+
+def test_a_camera_without_an_optical_axis_is_named() -> None:
+    matrices = ring_matrices(3, np.zeros(3))
+    matrices[1, 2, :3] = 0.0
+
+    with pytest.raises(ValueError, match="camera b: the projection matrix is singular"):
+        make_views(NAMES, SIZES, matrices)
+
+
+def test_integral_images_count_the_object_pixels_of_rectangles() -> None:
+    rng = np.random.default_rng(0)
+    views = make_views(NAMES, np.array([[7, 5], [3, 9], [1, 1]]), ring_matrices(3, np.zeros(3)))
+    masks = [rng.integers(0, 2, (h, w)).astype(np.uint8) * 255 for w, h in views.sizes_px]
+
+    hull = make_hull(views, masks)
+
+    for camera, mask in enumerate(masks):
+        np.testing.assert_array_equal(hull.mask(camera), mask > 0)
+        for _ in range(20):
+            y0, y1 = np.sort(rng.integers(0, mask.shape[0] + 1, 2))
+            x0, x1 = np.sort(rng.integers(0, mask.shape[1] + 1, 2))
+            integral = hull.integral(camera).astype(int)
+            count = integral[y1, x1] - integral[y0, x1] - integral[y1, x0] + integral[y0, x0]
+            assert count == (mask[y0:y1, x0:x1] > 0).sum()
+
+
+def test_masks_that_are_not_of_the_cameras_are_refused() -> None:
+    views = ring_views(2)
+    mask = np.zeros((486, 720), np.uint8)
+
+    with pytest.raises(ValueError, match="1 masks for 2 cameras"):
+        make_hull(views, [mask])
+    with pytest.raises(
+        ValueError, match=r"camera cam1 has shape \(720, 486\), expected \(486, 720\)"
+    ):
+        make_hull(views, [mask, mask.T])

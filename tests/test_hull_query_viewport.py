@@ -1,0 +1,80 @@
+"""Where samples lie, and how they are numbered."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridve.hull.query.viewport import (
+    MAX_VIEWPORT,
+    n_samples,
+    sample_positions,
+    sample_steps,
+    viewports_for_accuracy,
+)
+
+CORNERS = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 6.0, 3.0]])
+
+
+@pytest.mark.parametrize("viewport", [1, 2, 3, 10, 33, 100])
+def test_samples_are_numbered_row_by_row(viewport: int) -> None:
+    expected = [(i, j) for j in range(viewport) for i in range(viewport - j)]
+
+    i, j = sample_steps(
+        np.full(len(expected), viewport, np.int32), np.arange(len(expected), dtype=np.uint32)
+    )
+
+    assert n_samples(viewport) == len(expected)
+    assert list(zip(i.tolist(), j.tolist(), strict=True)) == expected
+
+
+@given(viewport=st.integers(1, MAX_VIEWPORT), data=st.data())
+def test_a_number_leads_back_to_its_steps(viewport: int, data: st.DataObject) -> None:
+    j = data.draw(st.integers(0, viewport - 1))
+    i = data.draw(st.integers(0, viewport - 1 - j))
+    number = j * viewport - j * (j - 1) // 2 + i
+
+    found = sample_steps(np.array([viewport], np.int32), np.array([number], np.uint32))
+
+    assert [step.tolist() for step in found] == [[i], [j]]
+
+
+def test_samples_lie_on_vertices_and_edges() -> None:
+    positions = sample_positions(
+        np.tile(CORNERS, (10, 1, 1)), np.full(10, 4, np.int32), np.arange(10, dtype=np.uint32)
+    )
+
+    # Samples 0, 3 and 9 are a, b and c; 5 is the only one inside: a third of the way to each.
+    np.testing.assert_allclose(positions[[0, 3, 9]], CORNERS)
+    np.testing.assert_allclose(positions[5], CORNERS.mean(axis=0))
+
+
+def test_a_viewport_of_one_samples_the_centroid() -> None:
+    positions = sample_positions(CORNERS[None], np.array([1], np.int32), np.zeros(1, np.uint32))
+
+    np.testing.assert_allclose(positions, [[1.0, 2.0, 1.0]])
+
+
+@given(
+    lengths=st.lists(st.floats(1e-6, 10.0), min_size=1, max_size=5),
+    accuracy_m=st.floats(2e-4, 1.0),
+)
+def test_the_chosen_viewport_is_the_smallest_that_keeps_the_accuracy(
+    lengths: list[float], accuracy_m: float
+) -> None:
+    corners = np.zeros((len(lengths), 3, 3))
+    corners[:, 1, 0] = lengths
+    corners[:, 2, 1] = 1e-7
+
+    viewports = viewports_for_accuracy(corners, accuracy_m)
+
+    longest = np.hypot(lengths, 1e-7)
+    rounding = 1 + 1e-12
+    assert (longest / (viewports - 1) <= accuracy_m * rounding).all()
+    coarser = viewports > 2
+    assert (longest[coarser] * rounding / (viewports[coarser] - 2) > accuracy_m).all()
+
+
+def test_an_accuracy_beyond_every_viewport_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"viewport of \d+, more than 65535"):
+        viewports_for_accuracy(CORNERS[None], 1e-6)
