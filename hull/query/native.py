@@ -23,9 +23,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.jit import compiled
 from hybridve.hull.query.bounds import ROUNDOFF_FLOAT64, rectangle_pads
 from hybridve.hull.query.engine import Hits, Triangles
-from hybridve.hull.query.jit import compiled
 from hybridve.hull.query.silhouettes import Hull, Views
 
 #: Triangles that a thread takes at a time, at most, and samples that these may have together.

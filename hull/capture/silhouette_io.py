@@ -1,0 +1,194 @@
+"""Silhouettes of a whole session in one file, packed to bits.
+
+Each frame of each camera is one chunk: eight pixels a byte, rows padded to whole bytes, compressed
+and with a checksum. Reading takes what is asked for and no more. A file stands under its final
+name only when it is complete.
+"""
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import ReportError
+
+FORMAT = "hybridve-silhouettes"
+VERSION = 1
+
+_STORED = {"compression": "gzip", "shuffle": True, "fletcher32": True, "track_times": False}
+
+
+class SilhouetteWriter:
+    """Takes in silhouettes frame by frame; the file appears when it is left without an error.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    names : list of str
+        The cameras, C of them.
+    sizes_px : list of (width, height)
+        The size of each camera's images.
+    stamp : str
+        What the silhouettes were made from; see `hull.capture.recording.silhouette_stamp`.
+
+    Raises
+    ------
+    ReportError
+        If the file cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, names: list[str], sizes_px: list[tuple[int, int]], stamp: str
+    ) -> None:
+        self._path = path
+        self._partial = path.with_name(path.name + ".partial")
+        self._sizes_px = sizes_px
+        self._reasons: list[str] = []
+        try:
+            self._file = h5py.File(self._partial, "w")
+        except OSError as error:
+            raise ReportError(f"{path}: cannot be written: {error}") from error
+        self._file.attrs["format"] = FORMAT
+        self._file.attrs["version"] = VERSION
+        for name, text in (("cameras", json.dumps(names)), ("stamp", stamp)):
+            self._file.create_dataset(name, data=text, track_times=False)
+        self._masks = []
+        for number, (width, height) in enumerate(sizes_px):
+            row_bytes = -(-width // 8)
+            dataset = self._file.create_dataset(
+                f"masks/{number}",
+                (0, height, row_bytes),
+                np.uint8,
+                chunks=(1, height, row_bytes),
+                maxshape=(None, height, row_bytes),
+                **_STORED,
+            )
+            dataset.attrs["camera"] = names[number]
+            dataset.attrs["width_px"] = width
+            dataset.attrs["unit"] = "1"
+            dataset.attrs["description"] = "object pixels, eight a byte, the leftmost highest"
+            self._masks.append(dataset)
+
+    def append(self, masks: list[NDArray[np.uint8]] | None, reason: str = "") -> None:
+        """Take in one frame: per camera a (H, W) mask, above 0 on object pixels.
+
+        `masks` is None where a camera lacks the frame; `reason` says why.
+        """
+        for number, dataset in enumerate(self._masks):
+            dataset.resize(len(self._reasons) + 1, axis=0)
+            if masks is None:
+                continue
+            width, height = self._sizes_px[number]
+            if masks[number].shape != (height, width):
+                raise ValueError(f"mask {number} is {masks[number].shape}, not {(height, width)}")
+            dataset[-1] = np.packbits(masks[number] > 0, axis=1)
+        self._reasons.append("" if masks is not None else reason or "a camera lacks this frame")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Complete the file, or remove what there is of it if something went wrong."""
+        if kind is not None:
+            self._file.close()
+            self._partial.unlink(missing_ok=True)
+            return
+        texts = [reason.encode() for reason in self._reasons]
+        kind_of_text = h5py.string_dtype("utf-8", max([1, *map(len, texts)]))
+        reasons = self._file.create_dataset(
+            "reason", data=np.array(texts, kind_of_text), track_times=False
+        )
+        reasons.attrs["unit"] = "1"
+        reasons.attrs["description"] = "why a frame has no silhouettes; empty if it has"
+        self._file.close()
+        self._partial.replace(self._path)
+
+
+class SilhouetteReader:
+    """Reads the silhouettes of single frames.
+
+    Attributes
+    ----------
+    names : list of str
+        The cameras.
+    stamp : str
+        What the silhouettes were made from.
+    n_frames : int
+        How many frames there are.
+
+    Raises
+    ------
+    ReportError
+        If there is no such file, it is of another format or version, or it is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        if not path.is_file():
+            raise ReportError(f"{path}: there are no silhouettes; run `hybridve segment` first")
+        try:
+            self._file = h5py.File(path, "r")
+        except OSError as error:
+            raise self._damaged(error) from error
+        try:
+            found = self._file.attrs.get("format", "an unknown format")
+            if found != FORMAT:
+                raise ReportError(f"{path}: holds {found}, expected {FORMAT}")
+            version = int(self._file.attrs["version"])
+            if version != VERSION:
+                raise ReportError(
+                    f"{path}: silhouettes of version {version}, this hybridve reads {VERSION}; "
+                    "run `hybridve segment --overwrite`"
+                )
+            self.names: list[str] = json.loads(self._file["cameras"].asstr()[()])
+            self.stamp: str = self._file["stamp"].asstr()[()]
+            self._reasons: list[str] = self._file["reason"].asstr()[:].tolist()
+            self._masks = [self._file[f"masks/{number}"] for number in range(len(self.names))]
+            self._widths_px = [int(dataset.attrs["width_px"]) for dataset in self._masks]
+        except (OSError, KeyError, ValueError) as error:
+            self._file.close()
+            raise self._damaged(error) from error
+        except ReportError:
+            self._file.close()
+            raise
+        self.n_frames = len(self._reasons)
+
+    def frame(self, index: int) -> tuple[list[NDArray[np.uint8]] | None, str]:
+        """Return per camera the (H, W) mask of one frame, 1 on object pixels.
+
+        The masks are None where a camera lacked the frame; the text says why.
+        """
+        if self._reasons[index]:
+            return None, self._reasons[index]
+        try:
+            masks = [
+                np.unpackbits(dataset[index], axis=1, count=width)
+                for dataset, width in zip(self._masks, self._widths_px, strict=True)
+            ]
+        except OSError as error:
+            raise self._damaged(error) from error
+        return masks, ""
+
+    def _damaged(self, error: Any) -> ReportError:
+        text = str(error).splitlines()[0]
+        return ReportError(
+            f"{self._path}: not readable silhouettes, or damaged ({text}); "
+            "run `hybridve segment --overwrite`"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file."""
+        self._file.close()
