@@ -216,10 +216,17 @@ def stored_frames(
         yield FrameSilhouettes(index, masks, "", decoded - started, time.perf_counter() - decoded)
 
 
-def silhouette_stamp(session: Session) -> str:
+def silhouette_stamp(session: Session, rig_digest: str | None) -> str:
     """Return a text that changes whenever the session's silhouettes could.
 
     It holds the settings, and of every file involved its name, size and time of change.
+
+    Parameters
+    ----------
+    session : Session
+        The recordings.
+    rig_digest : str or None
+        A digest of the rig by which pieces that no camera confirms were dropped; None if none were.
     """
     files = []
     for camera in session.cameras:
@@ -231,19 +238,24 @@ def silhouette_stamp(session: Session) -> str:
         {
             "segmentation": asdict(session.segmentation),
             "mask_threshold": session.mask_threshold,
+            "rig": rig_digest,
             "shift_frames": [camera.shift_frames for camera in session.cameras],
             "files": files,
         }
     )
 
 
-def stored_silhouettes(session: Session) -> Path | None:
-    """Return the stored silhouettes of a session, or None where none stand or they are stale."""
+def stored_silhouettes(session: Session, rig_digest: str) -> Path | None:
+    """Return the stored silhouettes of a session, or None where none stand or they are stale.
+
+    Silhouettes from which pieces were dropped by another rig than that of the digest are stale.
+    """
     path = session.folder / "silhouettes.h5"
     if not path.is_file():
         return None
     with SilhouetteReader(path) as reader:
-        return path if reader.stamp == silhouette_stamp(session) else None
+        stamps = [silhouette_stamp(session, digest) for digest in (None, rig_digest)]
+        return path if reader.stamp in stamps else None
 
 
 def undistort_mask(mask: Mask, undistortion: Undistortion) -> Mask:
