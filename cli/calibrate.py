@@ -1,6 +1,8 @@
 """``hybridve calibrate``: from pictures of a board to a rig."""
 
 import json
+import math
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +40,7 @@ def calibrate(
     """
     from hybridve.calib.colmap_io import write_colmap_model
     from hybridve.calib.rig_io import write_rig
-    from hybridve.hull.calibration import calibrate_session
+    from hybridve.hull.capture.rig import calibrate_session
     from hybridve.hull.capture.session import load_session
     from hybridve.hull.report.write import refuse_existing
 
@@ -59,8 +61,50 @@ def calibrate(
 
 
 def _numbers(path: Path, rig: "Rig") -> dict[str, Any]:
-    return {"rig": str(path)}
+    """Return what to tell of a rig, as plain JSON values."""
+    centers = rig.centers_world
+    return {
+        "rig": str(path),
+        "cameras": [
+            {
+                "name": camera.name,
+                "model": camera.model,
+                "center_m": camera.center_world.tolist(),
+                **rig.provenance.get("cameras", {}).get(camera.name, {}),
+            }
+            for camera in rig.cameras
+        ],
+        "distances_m": {
+            f"{rig.cameras[i].name} {rig.cameras[j].name}": math.dist(centers[i], centers[j])
+            for i, j in combinations(range(len(centers)), 2)
+        },
+        **{
+            key: rig.provenance[key]
+            for key in ("world", "rms_px", "labelling", "check")
+            if key in rig.provenance
+        },
+    }
 
 
 def _print(numbers: dict[str, Any]) -> None:
-    click.echo(numbers["rig"])
+    click.echo(f"{numbers['rig']}: {len(numbers['cameras'])} cameras")
+    for camera in numbers["cameras"]:
+        x, y, z = camera["center_m"]
+        parts = [f"  {camera['name']}: {camera['model']}, at ({x:.3f}, {y:.3f}, {z:.3f}) m"]
+        for kind, what in (("intrinsics", "stills"), ("extrinsics", "board clip")):
+            found = camera.get(kind, {})
+            if found.get("rms_px") is not None:
+                parts.append(f"{what} {found['rms_px']:.3f} px rms of {found['views_used']} views")
+        dropped = camera.get("intrinsics", {}).get("views_dropped", {})
+        without = camera.get("intrinsics", {}).get("views_without_board", {})
+        if dropped or without:
+            parts.append(f"{len(dropped)} views dropped, {len(without)} without a board")
+        click.echo("; ".join(parts))
+    pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in numbers["distances_m"].items())
+    click.echo(f"  distances, m: {pairs}")
+    if "rms_px" in numbers:
+        click.echo(f"  joint adjustment: {numbers['rms_px']:.3f} px rms over all views")
+    for key in ("labelling", "check"):
+        message = numbers.get(key, {}).get("message")
+        if message:
+            click.echo(f"  {message}")

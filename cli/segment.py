@@ -1,6 +1,7 @@
 """``hybridve segment``: silhouettes of a recording, stored beside the session."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import click
@@ -11,11 +12,18 @@ from hybridve.cli.progress import StageProgress, progress_bar
 
 @click.command(short_help="Cut the real things out of the recording.")
 @options.session_arg
+@click.option(
+    "--unconfirmed/--no-unconfirmed",
+    default=False,
+    help="Keep pieces that no other camera confirms. By default they are dropped where the session "
+    "has a rig; the hull is the same either way.",
+)
 @options.overwrite_option
 @options.json_option
 @options.quiet_progress
 def segment(
     session: Path,
+    unconfirmed: bool,
     overwrite: bool,
     as_json: bool,
     progress: bool,
@@ -23,8 +31,8 @@ def segment(
     r"""Cut the real things out of every frame of SESSION and keep their silhouettes.
 
     They are kept in silhouettes.h5 beside the session.toml; detect takes them from there as long
-    as neither the recordings nor the settings change. Without this command, detect cuts them out
-    as it goes.
+    as neither the recordings nor the settings nor the rig change. Without this command, detect cuts
+    them out as it goes.
 
     \b
     Example:
@@ -40,8 +48,11 @@ def segment(
         segmented_frames,
         silhouette_stamp,
     )
+    from hybridve.hull.capture.rig import has_rig, load_rig, rig_digest
     from hybridve.hull.capture.session import load_session
     from hybridve.hull.capture.silhouette_io import SilhouetteWriter
+    from hybridve.hull.consistency import drop_unconfirmed
+    from hybridve.hull.evaluate import rig_views
     from hybridve.hull.report.write import refuse_existing
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
@@ -50,22 +61,29 @@ def segment(
     refuse_existing(output, overwrite=overwrite)
     sizes_px = check_recording(loaded)
     check_lengths(loaded, FrameRange())
+    digest, clean = None, None
+    if not unconfirmed and has_rig(loaded):
+        rig = load_rig(loaded)
+        digest, clean = rig_digest(rig), partial(drop_unconfirmed, *rig_views(loaded, rig))
 
     names = [camera.name for camera in loaded.cameras]
     object_pixels = [0] * len(names)
     n_frames, n_invalid = 0, 0
     frames = segmented_frames(loaded, FrameRange(), progress=StageProgress(enabled=progress))
     with (
-        SilhouetteWriter(output, names, sizes_px, silhouette_stamp(loaded)) as writer,
+        SilhouetteWriter(output, names, sizes_px, silhouette_stamp(loaded, digest)) as writer,
         progress_bar("segment", claimed_length(loaded), enabled=progress) as advance,
     ):
         for frame in frames:
-            writer.append(frame.masks, frame.reason)
+            masks = frame.masks
+            if masks is not None and clean is not None:
+                masks = clean(masks)
+            writer.append(masks, frame.reason)
             n_frames += 1
-            if frame.masks is None:
+            if masks is None:
                 n_invalid += 1
             else:
-                for camera, mask in enumerate(frame.masks):
+                for camera, mask in enumerate(masks):
                     object_pixels[camera] += int(mask.sum())
             advance()
     shares = {
@@ -79,6 +97,7 @@ def segment(
                     "silhouettes": str(output),
                     "frames": n_frames,
                     "frames_invalid": n_invalid,
+                    "unconfirmed_dropped": clean is not None,
                     "mean_object_share": shares,
                     "bytes": output.stat().st_size,
                 }

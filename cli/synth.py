@@ -11,7 +11,13 @@ from hybridve.cli.progress import StageProgress
 @click.command(short_help="Generate a recording with known truth.")
 @click.argument("preset")
 @options.output_option("The folder to write the session into.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Other noise and textures; the motion stays the preset's.")
+@click.option(
+    "--seed",
+    type=int,
+    default=0,
+    show_default=True,
+    help="Other noise and textures; the motion stays the preset's.",
+)
 @click.option(
     "--n-frames", type=click.IntRange(1), help="Length of the recording; the preset's by default."
 )

@@ -15,21 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from hybridve.calib.errors import CalibrationError, SceneError, SessionError
+from hybridve.calib.errors import SceneError, SessionError
 from hybridve.calib.lens import Undistortion, undistortion
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import import_rig, read_rig
 from hybridve.hull.capture.recording import (
     FrameRange,
     FrameSilhouettes,
     check_lengths,
     check_recording,
     claimed_length,
-    recording_of,
     segmented_frames,
     stored_frames,
     stored_silhouettes,
 )
+from hybridve.hull.capture.rig import load_rig, rig_digest
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
@@ -89,45 +88,6 @@ class Chain:
     silhouettes: Path | None
 
 
-def load_rig(session: Session) -> Rig:
-    """Return the session's rig: the one it names, or the one that was calibrated for it.
-
-    Raises
-    ------
-    CalibrationError
-        If there is none, or it lacks a camera of the session, or is for images of another size.
-    """
-    sizes = {
-        camera.name: recording_of(session, camera).first().shape[1::-1]
-        for camera in session.cameras
-    }
-    if session.rig_file is not None:
-        rig = import_rig(
-            session.root,
-            session.rig_file.pattern,
-            session.rig_file.unit or "m",
-            session.rig_file.pixel_centre,
-            {name: (size[0], size[1]) for name, size in sizes.items()},
-            session.target.square_mm / 1000.0 if session.target is not None else None,
-        )
-    else:
-        path = session.folder / "rig" / "rig.json"
-        if not path.is_file():
-            raise CalibrationError(
-                f"{session.path}: there is no rig at {path}; run `hybridve calibrate "
-                f"{session.path}` first, or name one with rig ="
-            )
-        rig = read_rig(path)
-    for name, (width_px, height_px) in sizes.items():
-        camera = rig[name]
-        if (camera.width_px, camera.height_px) != (width_px, height_px):
-            raise CalibrationError(
-                f"{session.path}: camera {name!r} recorded {width_px}x{height_px}, but its rig is "
-                f"for {camera.width_px}x{camera.height_px}; calibrate it at the size recorded"
-            )
-    return rig
-
-
 def rig_views(session: Session, rig: Rig) -> tuple[Views, list[Undistortion]]:
     """Return the session's cameras as pinhole views, and how their images become so."""
     cameras = [rig[camera.name] for camera in session.cameras]
@@ -155,11 +115,11 @@ def make_chain(session: Session, scene: Scene, settings: EvaluateSettings) -> Ch
     HybridveError
         If recordings, rig and scene do not fit together.
     """
-    silhouettes = stored_silhouettes(session)
+    rig = load_rig(session)
+    silhouettes = stored_silhouettes(session, rig_digest(rig))
     if silhouettes is None:
         check_recording(session)
         check_lengths(session, settings.frames)
-    rig = load_rig(session)
     views, undistortions = rig_views(session, rig)
     bodies = []
     for scene_object in scene.objects:

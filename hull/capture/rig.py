@@ -1,0 +1,152 @@
+"""The rig of a session: calibrated from its pictures of the board, or made elsewhere and tested."""
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import asdict
+
+from hybridve.calib.calibrate import CameraInput, calibrate_rig, find_board
+from hybridve.calib.check import check_rig
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.rig import Rig
+from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict
+from hybridve.calib.target import Chessboard
+from hybridve.hull.capture.recording import recording_of
+from hybridve.hull.capture.session import RigFile, Session
+
+_log = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int], None]
+
+
+def calibrate_session(session: Session, progress: Progress | None = None) -> Rig:
+    """Return a session's rig from its pictures of the board, or the rig it names, tested.
+
+    Raises
+    ------
+    CalibrationError
+        If the session says too little, the board cannot be found, or a rig made elsewhere does not
+        fit the board that the session's cameras saw.
+    """
+    if session.rig_file is not None:
+        return _take_elsewhere(session, session.rig_file, progress)
+    if session.target is None:
+        raise CalibrationError(
+            f"{session.path}: has neither a [target] to calibrate with nor a rig made elsewhere; "
+            "describe the board, or name a rig with rig ="
+        )
+    for number, camera in enumerate(session.cameras, start=1):
+        if camera.extrinsics is None:
+            raise CalibrationError(
+                f"{session.path}: camera.{number} ({camera.name!r}) has no extrinsics; name the "
+                "recording in which all cameras see the board at once"
+            )
+    return calibrate_rig(_board(session), _inputs(session), progress=progress)
+
+
+def has_rig(session: Session) -> bool:
+    """Whether the session names a rig, or one was calibrated for it."""
+    return session.rig_file is not None or (session.folder / "rig" / "rig.json").is_file()
+
+
+def load_rig(session: Session) -> Rig:
+    """Return the session's rig: the one it names, or the one that was calibrated for it.
+
+    Raises
+    ------
+    CalibrationError
+        If there is none, or it lacks a camera of the session, or is for images of another size.
+    """
+    sizes_px = _recorded_sizes(session)
+    if session.rig_file is not None:
+        rig = _import(session, session.rig_file, sizes_px)
+    else:
+        path = session.folder / "rig" / "rig.json"
+        if not path.is_file():
+            raise CalibrationError(
+                f"{session.path}: there is no rig at {path}; run `hybridve calibrate "
+                f"{session.path}` first, or name one with rig ="
+            )
+        rig = read_rig(path)
+    for name, (width_px, height_px) in sizes_px.items():
+        camera = rig[name]
+        if (camera.width_px, camera.height_px) != (width_px, height_px):
+            raise CalibrationError(
+                f"{session.path}: camera {name!r} recorded {width_px}x{height_px}, but its rig is "
+                f"for {camera.width_px}x{camera.height_px}; calibrate it at the size recorded"
+            )
+    return rig
+
+
+def rig_digest(rig: Rig) -> str:
+    """Return a text that is the same for the same cameras only."""
+    cameras = rig_to_dict(rig)["cameras"]
+    return hashlib.sha256(json.dumps(cameras, sort_keys=True).encode()).hexdigest()
+
+
+def _take_elsewhere(session: Session, rig_file: RigFile, progress: Progress | None) -> Rig:
+    rig = _import(session, rig_file, _calibrated_sizes(session))
+    seeing = [camera for camera in session.cameras if camera.extrinsics is not None]
+    if session.target is None or len(seeing) < 2:
+        _log.warning(
+            "%s: the rig %r is taken as it is: there is no board in the session to test it against",
+            session.path,
+            rig_file.pattern,
+        )
+        return rig
+    corners = find_board(_board(session), _inputs(session), progress=progress)
+    check = check_rig(rig, _board(session), corners)
+    if not check.is_trustworthy:
+        raise CalibrationError(f"{session.path}: rig {rig_file.pattern!r}: {check.message}")
+    return Rig(rig.cameras, {**rig.provenance, "check": asdict(check)})
+
+
+def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, int]]) -> Rig:
+    rig = import_rig(
+        session.root,
+        rig_file.pattern,
+        rig_file.unit or "m",
+        rig_file.pixel_centre,
+        sizes_px,
+        session.target.square_mm / 1000.0 if session.target is not None else None,
+    )
+    # The session's cameras in the session's order; a rig may hold more.
+    return Rig(tuple(rig[camera.name] for camera in session.cameras), rig.provenance)
+
+
+def _recorded_sizes(session: Session) -> dict[str, tuple[int, int]]:
+    sizes_px = {}
+    for camera in session.cameras:
+        height_px, width_px = recording_of(session, camera).first().shape[:2]
+        sizes_px[camera.name] = (width_px, height_px)
+    return sizes_px
+
+
+def _calibrated_sizes(session: Session) -> dict[str, tuple[int, int]]:
+    """Return image sizes from the recordings or, where there is none yet, from the board's."""
+    sizes_px = {}
+    for camera in session.cameras:
+        source = camera.recording or camera.extrinsics or camera.intrinsics
+        if source is None:
+            raise CalibrationError(
+                f"{session.path}: camera {camera.name!r} has no picture at all; its image size "
+                "cannot be known"
+            )
+        height_px, width_px = source.first().shape[:2]
+        sizes_px[camera.name] = (width_px, height_px)
+    return sizes_px
+
+
+def _board(session: Session) -> Chessboard:
+    if session.target is None:
+        raise CalibrationError(f"{session.path}: has no [target]")
+    target = session.target
+    return Chessboard(target.columns, target.rows, target.square_mm / 1000.0)
+
+
+def _inputs(session: Session) -> list[CameraInput]:
+    return [
+        CameraInput(camera.name, camera.model, camera.intrinsics, camera.extrinsics, camera.corners)
+        for camera in session.cameras
+    ]
