@@ -89,12 +89,17 @@ def test_a_large_image_is_sampled_to_a_thousandth_of_a_pixel(
 
 
 def test_a_triangle_seen_on_edge_beside_a_pixel_edge_is_not_rejected(compute: Compute) -> None:
-    """The rectangle of such a triangle has no width: without its pad, rounding would move it."""
+    """The rectangle of such a triangle has no width: without its pad, rounding would move it.
+
+    The camera stands 60 m from the local origin, as it may where optical axes are nearly parallel:
+    single precision is then off by 0.01 px near the camera, in rectangles and, taken plainly, in
+    samples.
+    """
     rng = np.random.default_rng(2)
     n_triangles, column = 300, 801
-    pose = look_at(np.array([3.0, 1.0, 2.0]), np.array([0.1, 0.2, 0.3]), 0.4)
+    pose = look_at(np.array([52.0, 10.0, 28.0]), np.array([50.0, 9.0, 27.0]), 0.4)
     matrix = projection(pose, 1700.0, 1600, 1200)
-    views = make_views(("cam",), np.array([[1600, 1200]]), matrix[None])
+    views = Views(("cam",), np.array([[1600, 1200]]), matrix[None], np.zeros(3))
     mask = np.zeros((1200, 1600), np.uint8)
     mask[:, column] = 1
     hull = make_hull(views, [mask])
@@ -222,9 +227,9 @@ def test_what_belonged_to_a_mesh_leaves_the_device_with_it(compute: Compute) -> 
 
 def test_the_same_engine_serves_other_cameras(compute: Compute) -> None:
     mesh = sphere_mesh(2000, 0.2, viewport=5)
-    for n_cameras in (2, 9, 4, 17):
+    for n_cameras in (2, 9, 4, 17, 255):
         for center in ([0.2, 0.0, 0.0], [0.0, 0.1, 0.1]):
-            hull = ball_hull(ring_views(n_cameras, 200, 150, 200.0), np.array(center), 0.15)
+            hull = ball_hull(ring_views(n_cameras, 80, 60, 80.0), np.array(center), 0.15)
 
             (found,), (expected,) = compute.query(hull, [mesh]), native.query(hull, [mesh])
 

@@ -125,8 +125,8 @@ def test_no_meshes_and_empty_meshes_are_no_hits() -> None:
 def test_the_same_mesh_serves_other_cameras() -> None:
     mesh = sphere_mesh(500, 0.2)
     engine = Native(1)
-    for n_cameras in (2, 7, 3):
-        hull = ball_hull(ring_views(n_cameras, 200, 150, 200.0), np.array([0.2, 0.0, 0.0]), 0.15)
+    for n_cameras in (2, 7, 3, 255):
+        hull = ball_hull(ring_views(n_cameras, 80, 60, 80.0), np.array([0.2, 0.0, 0.0]), 0.15)
 
         (found,) = engine.query(hull, [mesh])
 

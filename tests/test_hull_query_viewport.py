@@ -28,15 +28,20 @@ def test_samples_are_numbered_row_by_row(viewport: int) -> None:
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == expected
 
 
-@given(viewport=st.integers(1, MAX_VIEWPORT), data=st.data())
-def test_a_number_leads_back_to_its_steps(viewport: int, data: st.DataObject) -> None:
-    j = data.draw(st.integers(0, viewport - 1))
-    i = data.draw(st.integers(0, viewport - 1 - j))
-    number = j * viewport - j * (j - 1) // 2 + i
+@given(viewport=st.integers(1, MAX_VIEWPORT) | st.just(MAX_VIEWPORT))
+def test_the_numbers_at_both_ends_of_a_row_lead_back_to_their_steps(viewport: int) -> None:
+    j = np.unique(np.linspace(0, viewport - 1, 1000).astype(np.int64))
+    first = j * viewport - j * (j - 1) // 2
+    last = first + viewport - 1 - j
+    viewports = np.full(len(j), viewport, np.int32)
 
-    found = sample_steps(np.array([viewport], np.int32), np.array([number], np.uint32))
+    i_first, j_first = sample_steps(viewports, first.astype(np.uint32))
+    i_last, j_last = sample_steps(viewports, last.astype(np.uint32))
 
-    assert [step.tolist() for step in found] == [[i], [j]]
+    np.testing.assert_array_equal(j_first, j)
+    np.testing.assert_array_equal(j_last, j)
+    np.testing.assert_array_equal(i_first, 0)
+    np.testing.assert_array_equal(i_last, viewport - 1 - j)
 
 
 def test_samples_lie_on_vertices_and_edges() -> None:

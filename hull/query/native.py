@@ -521,7 +521,8 @@ def _query_range(
             viewport = int(viewports[triangle])
             n_samples = viewport * (viewport + 1) // 2
             n_accept, n_abstain = votes[0, left], votes[1, left]
-            if reject and n_accept + n_abstain == n_cameras and n_accept >= min_cameras:
+            # Enough cameras see it, or it would have been dropped.
+            if reject and n_accept + n_abstain == n_cameras:
                 if n_hits + n_samples > len(hit_triangle):
                     hit_triangle = _grown(hit_triangle, n_hits, n_hits + n_samples)
                     hit_sample = _grown(hit_sample, n_hits, n_hits + n_samples)

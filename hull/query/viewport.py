@@ -48,10 +48,10 @@ def sample_steps(
     """
     u = viewports.astype(np.int64)
     number = samples.astype(np.int64)
-    # Rows above row j hold j u - j (j - 1) / 2 samples; solve for j, then mend the rounding.
+    # Rows above row j hold j u - j (j - 1) / 2 samples; solve for j. Nothing to mend: at the first
+    # sample of a row the discriminant is a square, whose root is exact, and elsewhere the root is
+    # more than 1e-5 away from the next whole number, since u is at most `MAX_VIEWPORT`.
     j = np.floor((2 * u + 1 - np.sqrt((2.0 * u + 1) ** 2 - 8.0 * number)) / 2).astype(np.int64)
-    j += (j + 1) * u - (j + 1) * j // 2 <= number
-    j -= j * u - j * (j - 1) // 2 > number
     i = number - (j * u - j * (j - 1) // 2)
     return i, j
 
