@@ -248,6 +248,16 @@ def test_without_opengl_one_line_says_what_to_install(monkeypatch: pytest.Monkey
         Compute()
 
 
+def test_a_driver_that_does_not_compile_the_shaders_is_named(
+    compute: Compute, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = "#version 430 core\nlayout(local_size_x = 1) in; void main() { nothing(); }"
+    monkeypatch.setattr(device_module, "load_shader", lambda name: broken)
+
+    with pytest.raises(DeviceError, match=r"does not compile volume_reject.*nothing.*native"):
+        compute.programs_for(4)
+
+
 def test_closing_twice_is_harmless(context: moderngl.Context) -> None:
     engine = Compute(context)
     engine.close()

@@ -92,6 +92,9 @@ class FakeCompute:
     name = "compute"
     renderer = "NVIDIA H100"
 
+    def programs_for(self, n_cameras: int) -> None:
+        pass
+
     def close(self) -> None:
         self.is_closed = True
 
@@ -120,3 +123,16 @@ def test_auto_takes_native_without_opengl(monkeypatch: pytest.MonkeyPatch) -> No
     assert open_engine("auto").name == "native"
     with pytest.raises(DeviceError):
         open_engine("compute")
+
+
+def test_auto_takes_native_where_the_driver_does_not_compile_the_shaders(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class OldDriver(FakeCompute):
+        def programs_for(self, n_cameras: int) -> None:
+            raise DeviceError("old driver does not compile")
+
+    monkeypatch.setattr(compute_module, "Compute", OldDriver)
+
+    assert open_engine("auto").name == "native"
+    assert "old driver does not compile" in caplog.text

@@ -1,7 +1,11 @@
 """Opens the engine that serves a query."""
 
+import logging
+
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query.engine import Engine, EngineName
+
+_logger = logging.getLogger(__name__)
 
 
 def open_engine(name: EngineName = "auto") -> Engine:
@@ -39,7 +43,7 @@ def open_engine(name: EngineName = "auto") -> Engine:
 
 
 def _open_on_hardware() -> Engine | None:
-    """Return the compute engine, or None where OpenGL is missing or software."""
+    """Return the compute engine, or None where OpenGL is missing, software, or too old."""
     try:
         from hybridve.hull.query.compute import Compute
         from hybridve.hull.query.device import is_software_renderer
@@ -47,7 +51,11 @@ def _open_on_hardware() -> Engine | None:
         engine = Compute()
     except (DeviceError, ImportError):  # ImportError: moderngl without the system's libraries
         return None
-    if is_software_renderer(engine.renderer):
-        engine.close()
-        return None
-    return engine
+    try:
+        if not is_software_renderer(engine.renderer):
+            engine.programs_for(1)
+            return engine
+    except DeviceError as error:
+        _logger.warning("%s", error)
+    engine.close()
+    return None

@@ -188,10 +188,16 @@ class Compute:
             return self._reserve(4)
         return self._context.buffer(np.ascontiguousarray(array))
 
-    def _programs_for(
-        self, n_cameras: int
-    ) -> tuple[moderngl.ComputeShader, moderngl.ComputeShader]:
-        """Return both passes, compiled with room for `n_cameras` in shared memory."""
+    def programs_for(self, n_cameras: int) -> tuple[moderngl.ComputeShader, moderngl.ComputeShader]:
+        """Return both passes, compiled with room for `n_cameras` in shared memory.
+
+        A query does so by itself; asked beforehand, it tells whether the driver compiles them.
+
+        Raises
+        ------
+        DeviceError
+            If the driver does not.
+        """
         room = _room(n_cameras)
         if room not in self._programs:
             constants = (
@@ -312,7 +318,7 @@ class Compute:
     ) -> tuple[int, int]:
         """Run both passes of some launches; return how many items and hits they have."""
         assert self._cameras is not None
-        reject, sample = self._programs_for(len(views))
+        reject, sample = self.programs_for(len(views))
         # Four counters a launch: the groups of its second pass (x, y, z), and its items. One more:
         # the hits of all.
         counters = np.zeros(4 * len(launches) + 1, np.uint32)

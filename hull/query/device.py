@@ -68,6 +68,18 @@ def compile_compute(context: moderngl.Context, name: str, *parts: str) -> modern
     """Return the compute program `name`, with `parts` (other shader sources) before its body.
 
     A shader file begins with ``#version`` and may hold one line ``// INSERT``, where the parts go.
+
+    Raises
+    ------
+    DeviceError
+        If the driver does not compile it.
     """
     source = load_shader(name).replace("// INSERT\n", "\n".join(parts) + "\n")
-    return context.compute_shader(source)
+    try:
+        return context.compute_shader(source)
+    except moderngl.Error as error:
+        complaint = " ".join(str(error).split())
+        raise DeviceError(
+            f"{renderer_name(context)} does not compile {name} ({complaint}); expected OpenGL 4.3 "
+            "with double precision: update the graphics driver, or take --engine native"
+        ) from error
