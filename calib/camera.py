@@ -33,6 +33,7 @@ N_PARAMS = {
     "DIVISION": 5,
     "SIMPLE_FISHEYE": 3,
     "FISHEYE": 4,
+    "EUCM": 6,
 }
 
 #: Models whose first parameter is one focal length for both axes.

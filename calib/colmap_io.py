@@ -1,0 +1,102 @@
+"""Rigs as COLMAP models: what COLMAP, and all that reads its models, works on."""
+
+import tempfile
+from pathlib import Path
+
+import pycolmap
+
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.rig import Rig
+
+
+def write_colmap_model(folder: Path, rig: Rig) -> None:
+    """Write a rig as a COLMAP text model: one rig, one frame, one image a camera.
+
+    The rig's first camera is COLMAP's reference sensor, so that the frame's pose is its pose.
+    Images are named after the cameras. The files are replaced one by one, each when complete.
+
+    Raises
+    ------
+    CalibrationError
+        If a camera has a skew, which COLMAP's models cannot hold, or the folder cannot be written.
+    """
+    model = pycolmap.Reconstruction()
+    colmap_rig = pycolmap.Rig(rig_id=1)
+    frame = pycolmap.Frame(frame_id=1, rig_id=1)
+    rig_from_world = rig.cameras[0].cam_from_world
+    for number, camera in enumerate(rig.cameras, start=1):
+        if camera.skew_px:
+            raise CalibrationError(
+                f"camera {camera.name!r} has a skew of {camera.skew_px:.3g} px, which no COLMAP "
+                "model holds; write rig.json only"
+            )
+        model.add_camera(
+            pycolmap.Camera(
+                camera_id=number,
+                model=camera.model,
+                width=camera.width_px,
+                height=camera.height_px,
+                params=camera.params,
+            )
+        )
+        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
+        if number == 1:
+            colmap_rig.add_ref_sensor(sensor)
+        else:
+            sensor_from_rig = compose(camera.cam_from_world, invert(rig_from_world))
+            colmap_rig.add_sensor(sensor, pycolmap.Rigid3d(sensor_from_rig))
+        frame.add_data_id(pycolmap.data_t(sensor, number))
+    model.add_rig(colmap_rig)
+    frame.rig_from_world = pycolmap.Rigid3d(rig_from_world)
+    model.add_frame(frame)
+    for number, camera in enumerate(rig.cameras, start=1):
+        model.add_image(
+            pycolmap.Image(name=camera.name, camera_id=number, image_id=number, frame_id=1)
+        )
+    model.register_frame(1)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".partial-") as partial:
+            model.write_text(partial)
+            for path in sorted(Path(partial).iterdir()):
+                path.replace(folder / path.name)
+    except OSError as error:
+        raise CalibrationError(f"{folder}: cannot be written ({error.strerror})") from error
+
+
+def read_colmap_model(folder: Path) -> Rig:
+    """Read the cameras of a COLMAP model, binary or text, each named after its image.
+
+    Raises
+    ------
+    CalibrationError
+        If the folder holds no model, or no image with a pose.
+    """
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+    except (ValueError, RuntimeError) as error:
+        raise CalibrationError(f"{folder}: not a COLMAP model that can be read") from error
+    cameras = []
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        lens = image.camera
+        cameras.append(
+            Camera(
+                image.name,
+                lens.model_name,
+                lens.width,
+                lens.height,
+                lens.params,
+                _pose(image.cam_from_world()),
+            )
+        )
+    if not cameras:
+        raise CalibrationError(f"{folder}: the COLMAP model holds no image with a pose")
+    return Rig(tuple(cameras), {"method": "COLMAP model", "folder": str(folder)})
+
+
+def _pose(transform: pycolmap.Rigid3d) -> Pose:
+    matrix: Pose = transform.matrix()
+    return matrix
