@@ -11,6 +11,7 @@ everyone should know to improve object retrieval*, CVPR 2012 (RootSIFT).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import cv2
@@ -255,6 +256,129 @@ def _agree(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LooksByVote:
+    """Which look of a symmetric board each camera saw, by votes for pairs of cameras.
+
+    Attributes
+    ----------
+    looks : tuple of int
+        One a camera, known up to a turn common to all.
+    margins_sigma : tuple of float
+        By how many standard deviations of chance votes (Poisson) this beats the same with that
+        one camera turned.
+    weakest_sigma : float
+        The same for the weakest link: turning any one camera, or one side of the tree of the
+        surest pairs.
+    """
+
+    looks: tuple[int, ...]
+    margins_sigma: tuple[float, ...]
+    weakest_sigma: float
+
+
+def choose_looks(votes: NDArray[np.float64]) -> LooksByVote:
+    """Choose the looks for which the votes of all pairs of cameras add up to most.
+
+    Pairs are joined in the order of their certainty; then single cameras, and sides of the tree
+    of joined pairs, are turned as long as that gains votes.
+
+    Parameters
+    ----------
+    votes : (C, C, L) float64
+        ``votes[i, j, k]``: for camera j to be k looks ahead of camera i.
+    """
+    looks = _vote(votes)
+    margins = tuple(_margin(votes, looks, {camera}) for camera in range(len(looks)))
+    links = [_margin(votes, looks, side) for side in _sides(votes, looks)]
+    return LooksByVote(tuple(looks), margins, min([*margins, *links], default=np.inf))
+
+
+def _vote(votes: NDArray[np.float64]) -> list[int]:
+    n_cameras, _, n_looks = votes.shape
+    groups: list[dict[int, int]] = [{camera: 0} for camera in range(n_cameras)]
+    while len(groups) > 1:
+        best: tuple[float, int, int, int] | None = None
+        for a, b in combinations(range(len(groups)), 2):
+            totals = np.zeros(n_looks)
+            for i, look_i in groups[a].items():
+                for j, look_j in groups[b].items():
+                    totals += np.roll(votes[i, j], look_i - look_j)
+            ranked = np.sort(totals)
+            lead = float(_sigmas(ranked[-1], ranked[-2]))
+            if best is None or lead > best[0] + 1e-12:
+                best = (lead, a, b, int(np.argmax(totals)))
+        assert best is not None
+        _, a, b, ahead = best
+        merged = groups[a] | {j: (look + ahead) % n_looks for j, look in groups[b].items()}
+        groups = [group for index, group in enumerate(groups) if index not in (a, b)] + [merged]
+    looks = [groups[0][camera] for camera in range(n_cameras)]
+    gains = True
+    while gains:
+        gains = False
+        for side in [{camera} for camera in range(n_cameras)] + _sides(votes, looks):
+            for ahead in range(1, n_looks):
+                turned = _turned(looks, side, ahead, n_looks)
+                if _total(votes, turned) > _total(votes, looks):
+                    looks, gains = turned, True
+    return looks
+
+
+def _turned(looks: Sequence[int], side: set[int], ahead: int, n_looks: int) -> list[int]:
+    return [
+        (look + ahead) % n_looks if camera in side else look for camera, look in enumerate(looks)
+    ]
+
+
+def _total(votes: NDArray[np.float64], looks: Sequence[int]) -> float:
+    pairs = combinations(range(len(looks)), 2)
+    return float(sum(votes[i, j, (looks[j] - looks[i]) % votes.shape[2]] for i, j in pairs))
+
+
+def _sides(votes: NDArray[np.float64], looks: Sequence[int]) -> list[set[int]]:
+    """Return the two-part splits of the cameras along the tree of their surest pairs."""
+    n_cameras = len(looks)
+    edges = sorted(
+        combinations(range(n_cameras), 2),
+        key=lambda edge: (
+            -votes[edge[0], edge[1], (looks[edge[1]] - looks[edge[0]]) % votes.shape[2]]
+        ),
+    )
+    part = list(range(n_cameras))
+    tree = []
+    for i, j in edges:
+        if part[i] != part[j]:
+            tree.append((i, j))
+            old, new = part[j], part[i]
+            part = [new if value == old else value for value in part]
+    sides = []
+    for cut in tree:
+        side = {cut[0]}
+        for _ in tree:
+            for i, j in tree:
+                if (i, j) != cut and (i in side) != (j in side):
+                    side |= {i, j}
+        sides.append(side)
+    return sides
+
+
+def _sigmas(more: float, less: float) -> float:
+    """Return by how many standard deviations two counts differ (Poisson)."""
+    return float((more - less) / np.sqrt(more + less + 1.0))
+
+
+def _margin(votes: NDArray[np.float64], looks: Sequence[int], side: set[int]) -> float:
+    """Return by how many standard deviations the looks beat those with one side turned."""
+    n_looks = votes.shape[2]
+    across = [(i, j) for i, j in combinations(range(len(looks)), 2) if (i in side) != (j in side)]
+
+    def count(candidate: Sequence[int]) -> float:
+        return float(sum(votes[i, j, (candidate[j] - candidate[i]) % n_looks] for i, j in across))
+
+    rival = max(count(_turned(looks, side, ahead, n_looks)) for ahead in range(1, n_looks))
+    return _sigmas(count(looks), rival)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RigCheck:
     """What a board clip says of a rig.
 
@@ -452,12 +576,15 @@ def _fit_board(
     for _ in range(100):
         # Seven unknowns: turn (radians), shift (in half diagonals of the board), size (relative).
         columns = []
-        for nudge in 1e-6 * np.eye(7):
+        for axis in range(7):
+            nudge = np.zeros(7)
+            nudge[axis] = 1e-6
             moved = residuals(*_moved(rotation, center, size, nudge, unit_m))
             columns.append((np.concatenate(moved) - np.concatenate(current)).ravel() / 1e-6)
         jacobian = np.stack(columns, axis=1)
         normal, right = jacobian.T @ jacobian, -jacobian.T @ np.concatenate(current).ravel()
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), right)
+        damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
+        step = np.asarray(np.linalg.solve(damped, right), np.float64)
         candidate = _moved(rotation, center, size, step, unit_m)
         if not candidate[2] > 0:
             damping *= 10.0

@@ -522,8 +522,8 @@ def _read_corners_opencv(path: Path) -> NDArray[np.float64] | None:
             return None
         node = storage.getNode("corners")
         if not node.empty():
-            matrix = node.mat()
-            return None if matrix is None else np.asarray(matrix, np.float64).reshape(-1, 2)
+            matrix = np.asarray(node.mat(), np.float64)
+            return matrix.reshape(-1, 2) if matrix.ndim > 1 and matrix.size % 2 == 0 else None
         amount = storage.getNode("CornersAmount")
         if amount.empty():
             return None

@@ -104,7 +104,7 @@ def detect(
                 chain,
                 query,
                 skip=writer.n_done,
-                write_s=lambda: writer.last_write_s,
+                write_s=writer.take_write_s,
                 progress=StageProgress(enabled=progress),
             )
             with progress_bar("detect", total, done=writer.n_done, enabled=progress) as advance:

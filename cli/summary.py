@@ -59,8 +59,8 @@ def print_summary(report: "Report") -> None:
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         click.echo("  " + "  ".join(cells).rstrip())
-    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in numbers["stage_ms_median"].items())
-    click.echo(f"  ms of work a frame, median: {stages}; engine {numbers['engine']}")
+    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in numbers["stage_ms_mean"].items())
+    click.echo(f"  ms of work a frame, mean: {stages}; engine {numbers['engine']}")
 
 
 def _spans_text(spans: list[dict[str, float]]) -> str:

@@ -154,7 +154,7 @@ def evaluate(
     skip : int
         How many frames at the start are done already.
     write_s : callable
-        Tells how long the last write took; it is kept with the frame that follows it.
+        Tells how long was spent on writing since it was last asked; kept with the next frame.
     progress : callable, optional
         Told ``(what, done, total)`` while the backgrounds are learnt.
 

@@ -17,7 +17,7 @@ def summarize(report: Report) -> dict[str, Any]:
     -------
     dict
         ``report``, ``frames``, ``frames_invalid``, ``reasons`` (text to count), ``seconds`` (from
-        first to last frame), ``engine``, ``renderer``, ``stage_ms_median`` and ``objects``: for
+        first to last frame), ``engine``, ``renderer``, ``stage_ms_mean`` and ``objects``: for
         each ``name``, ``verdict`` ("colliding", "free": proved in every evaluated frame, "clear":
         no sample collided), ``frames_colliding``, ``frames_proved_free``, ``spans`` of touching
         frames and the most points and triangles in one frame.
@@ -31,8 +31,8 @@ def summarize(report: Report) -> dict[str, Any]:
         "seconds": float(report.time_s[-1] - report.time_s[0]) if len(report.time_s) else 0.0,
         "engine": report.attributes.get("engine", ""),
         "renderer": report.attributes.get("renderer", ""),
-        "stage_ms_median": {
-            stage: float(np.median(seconds)) * 1e3 for stage, seconds in report.stage_s.items()
+        "stage_ms_mean": {
+            stage: float(np.mean(seconds)) * 1e3 for stage, seconds in report.stage_s.items()
         },
         "objects": [
             {"name": name, **_summarize_object(rows, report, is_valid)}

@@ -24,7 +24,13 @@ _VERSION = (2, 2)
 #: The kinds of cells of a PolyData, in VTK's order; collision points are vertices.
 _CELLS = ("Vertices", "Lines", "Polygons", "Strips")
 
-_STORED = {"compression": "gzip", "shuffle": True, "fletcher32": True, "track_times": False}
+_STORED = {
+    "compression": "gzip",
+    "compression_opts": 1,
+    "shuffle": True,
+    "fletcher32": True,
+    "track_times": False,
+}
 
 _CHUNK_POINTS = 16_384
 
