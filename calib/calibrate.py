@@ -3,7 +3,8 @@
 Each camera's lens is fitted to stills of the board; views that are blurred or wrong show by their
 own error and are dropped. The rig follows from a clip that shows the board to all cameras: lying
 still, then the clip is averaged, or being moved, then each frame ties the cameras together. At the
-end one bundle adjustment refines lenses, poses and boards from all views together.
+end one bundle adjustment refines lenses, poses and boards from all views together. Seeing
+(`observe_board`) and solving (`solve_rig`) are apart, so that pictures are searched once.
 
 The world is the board: Z points away from its printed side, so cameras are above the floor on
 which it lies. A board that looks the same when turned leaves open which way round each camera saw
@@ -14,19 +15,20 @@ given by hand vote with the order in which they are listed.
 import importlib.metadata
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import N_PARAMS, Camera
-from hybridve.calib.check import count_agreeing, describe_scene
+from hybridve.calib.check import choose_looks, count_agreeing, describe_scene
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import FrameSource, natural_order
 from hybridve.calib.pose import Pose, compose, invert
@@ -34,16 +36,17 @@ from hybridve.calib.rig import Rig
 from hybridve.calib.solve import (
     Adjustment,
     BoardView,
+    FittedLens,
     adjust,
+    fit_lens,
     link_cameras,
     locate_board,
     rms,
-    seed_camera,
 )
 from hybridve.calib.target import (
     Chessboard,
+    Detection,
     detect_corners,
-    grey_of,
     list_corners,
     read_corners,
     refine_corners,
@@ -52,6 +55,8 @@ from hybridve.calib.target import (
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,10 +130,6 @@ _SPREAD_FRAMES = 9
 #: Bytes of grey frames of one clip held at once; larger images are averaged over fewer frames.
 _CLIP_BYTES = 200_000_000
 
-#: Views from which the focal length is seeded: more do not change it, and each is located once
-#: for every focal length tried.
-_SEED_VIEWS = 12
-
 #: An order of corners that was given by hand counts as this many agreeing matches of the scene.
 _HAND_VOTES = 6.0
 
@@ -139,44 +140,69 @@ _WEAK_EVIDENCE = 3.0
 #: not determined.
 _TILT_FACTOR = 1.5
 
+#: A board clip that misses its lens by this many times `max_view_px` is another camera's.
+_WRONG_CLIP_FACTOR = 5.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Stills:
-    """The board in the stills of one camera: (name, corners) and names of stills without it."""
+class Stills:
+    """The board in the stills of one camera.
+
+    Attributes
+    ----------
+    size_px : (width, height) or None
+        Of the stills; None where there are none.
+    corners : dict of str to (N, 2) float64
+        By the name of a still the board's corners, pixels.
+    missed : dict of str to str
+        Stills that do not count, and why.
+    """
 
     size_px: tuple[int, int] | None
-    seen: tuple[tuple[str, NDArray[np.float64]], ...]
+    corners: dict[str, NDArray[np.float64]]
     missed: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Clip:
-    """The board in the extrinsic clip of one camera."""
+class Clip:
+    """The board in the extrinsic clip of one camera.
+
+    Attributes
+    ----------
+    size_px : (width, height)
+        Of its frames.
+    corners : dict of int to (N, 2) float64
+        By frame the board's corners, pixels; one frame, 0, where the board lies still.
+    is_still : bool
+        Whether it does, so that the clip could be averaged.
+    picture : (H, W) float32, or None
+        The average of a still clip, in grey levels.
+    how : str
+        How the corners were found.
+    spread_px : float or None
+        How far the worst corner strays from frame to frame (median over frames).
+    hand_look : int or None
+        Which look of the board was listed by hand, if one was.
+    """
 
     size_px: tuple[int, int]
-    corners: dict[int, NDArray[np.float64]]  # by frame; one frame, 0, where the board lies still
+    corners: dict[int, NDArray[np.float64]]
     is_still: bool
-    picture: NDArray[np.float32]  # the average of the clip, grey
-    how: str
-    spread_px: float | None
-    hand_look: int | None  # which look of the board the order given by hand is, of corners[0]
+    picture: NDArray[np.float32] | None = None
+    how: str = "given"
+    spread_px: float | None = None
+    hand_look: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Lens:
-    """A camera's lens and the views it was fitted to."""
+class Observations:
+    """All that one camera saw of the board; what a rig is solved from."""
 
-    camera: Camera
-    used: tuple[tuple[str, NDArray[np.float64], Pose], ...]
-    dropped: dict[str, str]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Labelling:
-    """Which look of the board each camera saw, and how sure that is."""
-
-    looks: tuple[int, ...]
-    evidence: dict[str, Any] = field(default_factory=dict)
+    name: str
+    model: str
+    stills: Stills
+    clip: Clip
+    sources: dict[str, str | None] = field(default_factory=dict)
 
 
 def calibrate_rig(
@@ -211,77 +237,46 @@ def calibrate_rig(
         Naming the camera, and what was tried, where no board is found, too few views fit, or a
         camera shares no view of the board with the others.
     """
-    report = progress or (lambda what, done, total: None)
-    _check_inputs(cameras)
-    # The rig's numbers must not depend on the order in which cameras are listed.
-    ordered = sorted(cameras, key=lambda camera: natural_order(camera.name))
-    threads = settings.threads or os.cpu_count() or 1
-    with ThreadPoolExecutor(threads) as pool:
-        clips = _observe_clips(board, ordered, settings, pool, report)
-        stills = [
-            _observe_stills(board, camera, settings, pool, report, threads) for camera in ordered
-        ]
-    lenses = []
-    for index, (camera, clip, still) in enumerate(zip(ordered, clips, stills, strict=True)):
-        report("fitting lenses", index, len(ordered))
-        lenses.append(_fit_lens(board, camera, still, clip, settings))
-    report("fitting lenses", len(ordered), len(ordered))
-
-    lies_still = all(clip.is_still for clip in clips)
-    labelling = _Labelling(tuple(0 for _ in clips))
-    if lies_still:
-        labelling = _label_still_board(board, lenses, clips)
-        clips = [
-            replace(clip, corners={0: clip.corners[0][board.looks[look]]})
-            for clip, look in zip(clips, labelling.looks, strict=True)
-        ]
-    report("adjusting", 0, 1)
-    rig = _adjust_all(board, ordered, lenses, clips, stills, labelling, settings)
-    report("adjusting", 1, 1)
-    return Rig(tuple(rig[camera.name] for camera in cameras), rig.provenance)
+    return solve_rig(board, observe_board(board, cameras, settings, progress), settings, progress)
 
 
-def find_board(
+# --- What the pictures show -----------------------------------------------------------------
+
+
+def observe_board(
     board: Chessboard,
     cameras: list[CameraInput],
     settings: CalibrationSettings = _DEFAULTS,
     progress: Progress | None = None,
-) -> dict[str, NDArray[np.float64]]:
-    """Find the board's corners where all cameras see it at once, to check a rig made elsewhere.
+) -> list[Observations]:
+    """Find the board in all pictures: the slow half of `calibrate_rig`, and its parameters."""
+    report = progress or _no_progress
+    _check_inputs(cameras)
+    threads = settings.threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(threads) as pool:
+        clips = _observe_clips(board, cameras, settings, pool, report)
+        stills = [
+            _observe_stills(board, camera, settings, pool, 2 * threads, report)
+            for camera in cameras
+        ]
+    return [
+        Observations(
+            camera.name,
+            camera.model,
+            still,
+            clip,
+            {
+                "intrinsics": camera.intrinsics.label if camera.intrinsics else None,
+                "extrinsics": camera.extrinsics.label if camera.extrinsics else None,
+                "corners": camera.corners.name if camera.corners else None,
+            },
+        )
+        for camera, still, clip in zip(cameras, stills, clips, strict=True)
+    ]
 
-    Parameters
-    ----------
-    board : Chessboard
-        The board.
-    cameras : list of CameraInput
-        The cameras; those without extrinsics are left out.
-    settings : CalibrationSettings
-        How it is done.
-    progress : callable, optional
-        Called with what is being done, how many of it are done, and how many there are.
 
-    Returns
-    -------
-    dict of str to (N, 2) float64
-        By camera the corners in pixels, of the averaged clip if the board lies still in it, else
-        of the frame in which most cameras see it.
-
-    Raises
-    ------
-    CalibrationError
-        Naming the camera, and what was tried, where no board is found.
-    """
-    report = progress or (lambda what, done, total: None)
-    seeing = [camera for camera in cameras if camera.extrinsics is not None]
-    with ThreadPoolExecutor(settings.threads or os.cpu_count() or 1) as pool:
-        clips = _observe_clips(board, seeing, settings, pool, report)
-    frames = {frame for clip in clips for frame in clip.corners}
-    best = max(sorted(frames), key=lambda frame: sum(frame in clip.corners for clip in clips))
-    return {
-        camera.name: clip.corners[best]
-        for camera, clip in zip(seeing, clips, strict=True)
-        if best in clip.corners
-    }
+def _no_progress(what: str, done: int, total: int) -> None:
+    del what, done, total
 
 
 def _check_inputs(cameras: Sequence[CameraInput]) -> None:
@@ -305,55 +300,49 @@ def _check_inputs(cameras: Sequence[CameraInput]) -> None:
             )
 
 
-# --- What the pictures show -----------------------------------------------------------------
-
-
 def _observe_stills(
     board: Chessboard,
     camera: CameraInput,
     settings: CalibrationSettings,
     pool: ThreadPoolExecutor,
+    in_flight: int,
     report: Progress,
-    threads: int,
-) -> _Stills:
+) -> Stills:
     source = camera.intrinsics
     if source is None or (camera.extrinsics and source.paths == camera.extrinsics.paths):
-        return _Stills(None, (), {})  # the views of the extrinsic clip serve
-    length = max(1, source.claimed_length())
-    step = -(-length // settings.max_stills)
-    total = -(-length // step)
-    seen: list[tuple[str, NDArray[np.float64]]] = []
-    missed: dict[str, str] = {}
+        return Stills(None, {}, {})  # the views of the extrinsic clip serve
+    step = -(-max(1, source.claimed_length()) // settings.max_stills)
+    total = -(-max(1, source.claimed_length()) // step)
     sizes: dict[str, tuple[int, int]] = {}
-    waiting: list[tuple[str, Future[Any]]] = []
+    corners: dict[str, NDArray[np.float64]] = {}
+    missed: dict[str, str] = {}
+    waiting: deque[tuple[str, Future[Detection]]] = deque()
 
     def collect(down_to: int) -> None:
         while len(waiting) > down_to:
-            name, future = waiting.pop(0)
-            detection = future.result()
-            if detection.corners is None:
+            name, future = waiting.popleft()
+            found = future.result().corners
+            if found is None:
                 missed[name] = "no board found"
             else:
-                seen.append((name, detection.corners))
-            report(f"{camera.name}: stills", len(seen) + len(missed), total)
+                corners[name] = found
+            report(f"stills of {camera.name}", len(corners) + len(missed), total)
 
     for index, image in enumerate(source.frames(step=step)):
         name = f"frame {index * step}" if source.is_video else source.paths[index * step].name
         sizes[name] = (image.shape[1], image.shape[0])
         waiting.append((name, pool.submit(detect_corners, image, board, False)))
-        collect(2 * threads)  # frames in flight, so that memory does not grow with the source
+        collect(in_flight)  # so that memory does not grow with the source
     collect(0)
     if not sizes:
         raise CalibrationError(f"camera {camera.name!r}: {source.label} holds no picture")
-    counted = list(sizes.values())
-    size_px = max(set(counted), key=lambda size: (counted.count(size), size))
-    for name, corners in list(seen):
-        if sizes[name] != size_px:
-            missed[name] = "is {}x{}, the others {}x{}".format(*sizes[name], *size_px)
-            seen = [item for item in seen if item[0] != name]
-            del corners
-    logger.info("camera %s: board found in %d of %d stills", camera.name, len(seen), len(sizes))
-    return _Stills(size_px, tuple(seen), missed)
+    logger.info("camera %s: board found in %d of %d stills", camera.name, len(corners), len(sizes))
+    counts = Counter(sizes.values())
+    size_px = max(counts, key=lambda size: (counts[size], size))
+    for name in [name for name in corners if sizes[name] != size_px]:
+        del corners[name]
+        missed[name] = "is {}x{} pixels, most are {}x{}".format(*sizes[name], *size_px)
+    return Stills(size_px, corners, missed)
 
 
 def _observe_clips(
@@ -362,30 +351,31 @@ def _observe_clips(
     settings: CalibrationSettings,
     pool: ThreadPoolExecutor,
     report: Progress,
-) -> list[_Clip]:
+) -> list[Clip]:
     sources = [camera.extrinsics for camera in cameras if camera.extrinsics is not None]
     # One step for all cameras: frames with the same number were taken at the same time.
     length = max(1, min(source.claimed_length() for source in sources))
     step = -(-length // settings.clip_frames)
-    clips: list[_Clip | None] = []
-    futures = [
+    still = [
         pool.submit(_observe_still_clip, board, camera, source, step, settings)
         for camera, source in zip(cameras, sources, strict=True)
     ]
-    for index, future in enumerate(futures):
-        clips.append(future.result())
-        report("board clips", index + 1, len(cameras))
-    if any(clip is None for clip in clips):
-        futures_moving = [
-            pool.submit(_observe_moving_clip, board, camera, source, step)
-            for camera, source in zip(cameras, sources, strict=True)
-        ]
-        moving = []
-        for index, moving_future in enumerate(futures_moving):
-            moving.append(moving_future.result())
-            report("moving board", index + 1, len(cameras))
-        return moving
-    return [clip for clip in clips if clip is not None]
+    clips = list(_collected(still, "board clips", report))
+    if all(clip is not None for clip in clips):
+        return [clip for clip in clips if clip is not None]
+    logger.info("the board moves in the clips: each frame is looked at")
+    moving = [
+        pool.submit(_observe_moving_clip, board, camera, source, step)
+        for camera, source in zip(cameras, sources, strict=True)
+    ]
+    return list(_collected(moving, "clips with a moving board", report))
+
+
+def _collected(futures: Sequence[Future[T]], what: str, report: Progress) -> Iterator[T]:
+    report(what, 0, len(futures))
+    for done, future in enumerate(futures, start=1):
+        yield future.result()
+        report(what, done, len(futures))
 
 
 def _observe_still_clip(
@@ -394,7 +384,7 @@ def _observe_still_clip(
     source: FrameSource,
     step: int,
     settings: CalibrationSettings,
-) -> _Clip | None:
+) -> Clip | None:
     """Return the corners averaged over a clip; None if the board moves in it."""
     frames = _sample(source, step)
     if not frames:
@@ -407,22 +397,22 @@ def _observe_still_clip(
     picture = _steady_mean(frames)
     by_hand = _corners_by_hand(board, camera)
     detection = detect_corners(picture, board, thorough=False)
-    if detection.corners is None and len(frames) > 1:
-        some = [frames[index] for index in np.linspace(0, len(frames) - 1, 3).round().astype(int)]
-        quick = [detect_corners(frame, board, thorough=False).corners for frame in some]
-        found = [corners for corners in quick if corners is not None]
-        if any(np.abs(a - b).max() > settings.still_px for a, b in combinations(found, 2)):
-            return None
     if detection.corners is None:
+        if _moves(board, frames, settings):
+            return None
         detection = detect_corners(picture, board)
-    how, corners = f"detected ({detection.how})", detection.corners
+    corners, how = detection.corners, f"detected ({detection.how})"
     if corners is None and by_hand is not None:
         corners = refine_corners(picture, board, by_hand)
         how = "marked by hand, refined"
         if corners is None:
             corners, how = by_hand, "marked by hand, not refined: no chessboard at that place"
         logger.warning(
-            "camera %s: no board found in %s; corners %s", camera.name, source.label, how
+            "camera %s: no board found in %s (%s); corners %s",
+            camera.name,
+            source.label,
+            detection.how,
+            how,
         )
     if corners is None:
         raise CalibrationError(
@@ -430,40 +420,31 @@ def _observe_still_clip(
             f"in {source.label} (average of {len(frames)} frames; {detection.how}); check columns "
             "and rows, or mark the corners by hand (`corners`)"
         )
-    spread_px = None
-    if len(frames) > 1:
-        chosen = np.linspace(0, len(frames) - 1, min(_SPREAD_FRAMES, len(frames))).round()
-        offsets = [
-            np.inf if again is None else float(np.abs(again - corners).max())
-            for again in (
-                refine_corners(frames[index], board, corners) for index in chosen.astype(int)
-            )
-        ]
-        spread_px = float(np.median(offsets))
-        if spread_px > settings.still_px and not how.startswith("marked"):
-            return None
+    spread_px = _spread(board, frames, corners)
+    if spread_px is not None and spread_px > settings.still_px and by_hand is None:
+        return None
     hand_look = None
     if by_hand is not None:
         misses = [float(np.abs(corners[look] - by_hand).max()) for look in board.looks]
         hand_look = int(np.argmin(misses))
-        if min(misses) > 0.02 * max(size_px):
+        sides = np.linalg.norm(np.diff(by_hand.reshape(board.rows, -1, 2), axis=1), axis=-1)
+        if min(misses) > float(sides.max()):
             logger.warning(
-                "camera %s: corners marked by hand are up to %.0f px away from those found; "
-                "the found ones are taken",
+                "camera %s: the corners marked by hand are %.0f px away from those found in %s; "
+                "those found are taken",
                 camera.name,
                 min(misses),
+                source.label,
             )
             hand_look = None
-    if spread_px is not None and not np.isfinite(spread_px):
-        spread_px = None
-    return _Clip(size_px, {0: corners}, True, picture, how, spread_px, hand_look)
+    return Clip(size_px, {0: corners}, True, picture, how, spread_px, hand_look)
 
 
 def _sample(source: FrameSource, step: int) -> list[NDArray[np.uint8]]:
     """Return every `step`-th frame in grey, fewer where frames are large."""
     frames: list[NDArray[np.uint8]] = []
     for image in source.frames(step=step):
-        if (len(frames) + 1) * image.shape[0] * image.shape[1] > _CLIP_BYTES and len(frames) > 4:
+        if len(frames) > 4 and (len(frames) + 1) * image.shape[0] * image.shape[1] > _CLIP_BYTES:
             break
         frames.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
     return frames
@@ -481,6 +462,28 @@ def _steady_mean(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
         strip = np.sort(np.stack([frame[row : row + 64] for frame in frames]), axis=0)
         mean[row : row + 64] = strip[quarter : len(frames) - quarter].mean(axis=0)
     return mean
+
+
+def _moves(
+    board: Chessboard, frames: Sequence[NDArray[np.uint8]], settings: CalibrationSettings
+) -> bool:
+    """Tell whether the board is found in different places of a clip's first, middle, last frame."""
+    chosen = sorted({0, len(frames) // 2, len(frames) - 1})
+    found = [detect_corners(frames[index], board, thorough=False).corners for index in chosen]
+    seen = [corners for corners in found if corners is not None]
+    return any(np.abs(a - b).max() > settings.still_px for a, b in combinations(seen, 2))
+
+
+def _spread(
+    board: Chessboard, frames: Sequence[NDArray[np.uint8]], corners: NDArray[np.float64]
+) -> float | None:
+    """Return how far the worst corner strays, median over frames; inf where most show no board."""
+    if len(frames) == 1:
+        return None
+    chosen = np.linspace(0, len(frames) - 1, min(_SPREAD_FRAMES, len(frames))).round().astype(int)
+    again = [refine_corners(frames[index], board, corners) for index in chosen]
+    strays = [np.inf if seen is None else float(np.abs(seen - corners).max()) for seen in again]
+    return float(np.median(strays))
 
 
 def _corners_by_hand(board: Chessboard, camera: CameraInput) -> NDArray[np.float64] | None:
@@ -504,12 +507,12 @@ def _corners_by_hand(board: Chessboard, camera: CameraInput) -> NDArray[np.float
 
 def _observe_moving_clip(
     board: Chessboard, camera: CameraInput, source: FrameSource, step: int
-) -> _Clip:
+) -> Clip:
     corners: dict[int, NDArray[np.float64]] = {}
-    picture = np.zeros((1, 1), np.float32)
+    size_px = (0, 0)
     count = 0
     for index, image in enumerate(source.frames(step=step)):
-        picture = grey_of(image)
+        size_px = (image.shape[1], image.shape[0])
         count += 1
         found = detect_corners(image, board, thorough=False).corners
         if found is not None:
@@ -519,245 +522,205 @@ def _observe_moving_clip(
             f"camera {camera.name!r}: no board of {board.columns}x{board.rows} inner corners found "
             f"in any of {count} frames of {source.label}; check columns and rows"
         )
-    size_px = (picture.shape[1], picture.shape[0])
-    how = f"detected in {len(corners)} of {count} frames"
-    return _Clip(size_px, corners, False, picture, how, None, None)
+    return Clip(size_px, corners, False, how=f"detected in {len(corners)} of {count} frames")
 
 
-# --- Lenses ---------------------------------------------------------------------------------
+# --- From corners to a rig ------------------------------------------------------------------
 
 
-def _fit_lens(
+def solve_rig(
     board: Chessboard,
-    camera: CameraInput,
-    stills: _Stills,
-    clip: _Clip,
-    settings: CalibrationSettings,
-) -> _Lens:
-    """Fit one camera's lens to its views, dropping those that do not fit."""
+    observations: Sequence[Observations],
+    settings: CalibrationSettings = _DEFAULTS,
+    progress: Progress | None = None,
+) -> Rig:
+    """Solve lenses and poses from the corners that were seen: the quick half of `calibrate_rig`."""
+    report = progress or _no_progress
+    # The rig's numbers must not depend on the order in which cameras are listed.
+    ordered = sorted(observations, key=lambda seen: natural_order(seen.name))
+    lenses = []
+    for index, seen in enumerate(ordered):
+        report("fitting lenses", index, len(ordered))
+        lenses.append(_fit_lens(board, seen, settings))
+    report("fitting lenses", len(ordered), len(ordered))
+    report("adjusting everything", 0, 1)
+    clips = [seen.clip for seen in ordered]
+    labelling: dict[str, Any] = {"looks": len(board.looks), "decided_by": "the board's colours"}
+    if all(clip.is_still for clip in clips):
+        looks, labelling = _label_still_board(board, lenses, clips)
+        clips = [
+            replace(clip, corners={0: clip.corners[0][board.looks[look]]})
+            for clip, look in zip(clips, looks, strict=True)
+        ]
+    elif len(board.looks) > 1:
+        labelling["decided_by"] = "poses common to all frames"
+    placed, result, views, n_common = _adjust_all(board, lenses, clips, settings)
+    provenance = _provenance(
+        board, ordered, lenses, labelling, settings, views, n_common, result, placed
+    )
+    report("adjusting everything", 1, 1)
+    by_name = {camera.name: camera for camera in placed}
+    return Rig(tuple(by_name[seen.name] for seen in observations), provenance)
+
+
+def _fit_lens(board: Chessboard, seen: Observations, settings: CalibrationSettings) -> FittedLens:
+    stills, clip = seen.stills, seen.clip
     if stills.size_px is not None and stills.size_px != clip.size_px:
         raise CalibrationError(
             "camera {!r}: intrinsics are {}x{} pixels, extrinsics {}x{}; record both in the same "
-            "mode".format(camera.name, *stills.size_px, *clip.size_px)
+            "mode".format(seen.name, *stills.size_px, *clip.size_px)
         )
-    views = list(stills.seen)
+    views = dict(stills.corners)
     if not clip.is_still:
-        views += [(f"board clip, frame {frame}", seen) for frame, seen in clip.corners.items()]
+        views |= {_clip_view(frame): corners for frame, corners in clip.corners.items()}
     if len(views) < settings.min_views:
-        found = (
-            f"{len(views)} of {len(views) + len(stills.missed)} stills"
-            if stills.size_px
-            else (f"{len(views)} views")
-        )
+        found = f"in {len(views)} of {len(views) + len(stills.missed)} stills"
+        if stills.size_px is None:
+            found = "only lying still in the clip that all cameras see"
         raise CalibrationError(
-            f"camera {camera.name!r}: the board of {board.columns}x{board.rows} inner corners was "
-            f"found in {found}, expected {settings.min_views} or more; check columns and rows, or "
-            "take more pictures of it (`intrinsics`)"
+            f"camera {seen.name!r}: the board of {board.columns}x{board.rows} inner corners was "
+            f"found {found}, expected {settings.min_views} views or more to fit a lens; check "
+            "columns and rows, or take more pictures of it (`intrinsics`)"
         )
-    points = board.points_board
-    spread = np.linspace(0, len(views) - 1, min(len(views), _SEED_VIEWS)).round().astype(int)
-    lens = seed_camera(
-        camera.name, camera.model, clip.size_px, points, [views[index][1] for index in spread]
+
+    def limit_px(errors_px: Sequence[float]) -> float:
+        relative = settings.max_view_medians * float(np.median(errors_px))
+        return min(settings.max_view_px, max(relative, settings.always_good_px))
+
+    lens = fit_lens(
+        board.points_board,
+        seen.name,
+        seen.model,
+        clip.size_px,
+        views,
+        limit_px,
+        settings.min_views,
+        settings.loss_px,
     )
-    kept, boards = set(range(len(views))), dict[int, Pose]()
-    reasons: dict[int, str] = {}
-    fixed = True  # first without the principal point: the seed is rough
-    for _ in range(50):
-        for index in sorted(kept - boards.keys()):
-            located = locate_board(lens, points, views[index][1])
-            if located is not None:
-                boards[index] = located[0]
-        usable = sorted(kept & boards.keys())
-        if len(usable) < settings.min_views:
-            raise CalibrationError(
-                f"camera {camera.name!r}: only {len(usable)} of {len(views)} views of the board "
-                f"fit model {camera.model} to {settings.max_view_px:g} px; check columns and rows, "
-                "take sharper pictures, or choose another model"
-            )
-        result = adjust(
-            points,
-            [lens],
-            {index: boards[index] for index in usable},
-            [BoardView(0, index, views[index][1], views[index][0]) for index in usable],
-            settings.loss_px,
-            fix_principal_point=fixed,
-        )
-        lens = result.cameras[0]
-        boards.update(result.rig_from_board)
-        if fixed:
-            fixed = False
-            continue
-        errors = dict(zip(usable, map(rms, result.residuals_px), strict=True))
-        limit_px = _view_limit(list(errors.values()), settings)
-        # All views are asked again, also those that were dropped while the lens was rough.
-        for index in sorted(set(range(len(views))) - set(usable)):
-            located = locate_board(lens, points, views[index][1])
-            if located is not None and located[1] <= limit_px:
-                errors[index], boards[index] = located[1], located[0]
-        bad = sorted((i for i in errors if errors[i] > limit_px), key=lambda i: -errors[i])
-        # A wrong view spoils the error of the others: the worst fifth goes, then all are asked.
-        bad = bad[: max(1, len(usable) // 5)]
-        now = set(errors) - set(bad)
-        for index in set(range(len(views))) - now:
-            error = f"{errors[index]:.2f} px" if index in errors else "not seen by the lens"
-            if index in errors or index not in reasons:
-                reasons[index] = f"{error}, limit {limit_px:.2f} px"
-        if now == kept:
-            break
-        kept = now
-    dropped = {views[index][0]: reasons[index] for index in sorted(set(range(len(views))) - kept)}
-    for name, reason in dropped.items():
-        logger.info("camera %s: %s dropped: %s", camera.name, name, reason)
-    used = tuple((*views[index], boards[index]) for index in sorted(kept))
-    return _Lens(lens, used, dropped)
+    for name, reason in lens.dropped.items():
+        logger.info("camera %s: %s dropped: %s", seen.name, name, reason)
+    return lens
 
 
-def _view_limit(errors_px: Sequence[float], settings: CalibrationSettings) -> float:
-    relative = settings.max_view_medians * float(np.median(errors_px))
-    return min(settings.max_view_px, max(relative, settings.always_good_px))
-
-
-# --- Which way round the board was seen -----------------------------------------------------
+def _clip_view(frame: int) -> str:
+    return f"board clip, frame {frame}"
 
 
 def _label_still_board(
-    board: Chessboard, lenses: Sequence[_Lens], clips: Sequence[_Clip]
-) -> _Labelling:
-    """Choose the look of the board in each camera by what the cameras see around it."""
+    board: Chessboard, lenses: Sequence[FittedLens], clips: Sequence[Clip]
+) -> tuple[list[int], dict[str, Any]]:
+    """Choose the look of the board in each camera; return looks and evidence."""
     n_cameras, n_looks = len(lenses), len(board.looks)
-    if n_looks == 1 or n_cameras == 1:
-        look = clips[0].hand_look or 0
-        return _Labelling(tuple(look for _ in lenses), {"looks": n_looks, "needed": False})
-    poses = []
-    for lens, clip in zip(lenses, clips, strict=True):
-        located = locate_board(lens.camera, board.points_board, clip.corners[0])
-        if located is None:
-            raise _lens_misses_clip(lens.camera.name)
-        poses.append(located[0])
+    evidence: dict[str, Any] = {"looks": n_looks, "decided_by": "the board's colours"}
+    looks = [0] * n_cameras
+    if n_looks > 1 and n_cameras > 1:
+        votes, matches = _votes_of_scene(board, lenses, clips)
+        for i, j in combinations(range(n_cameras), 2):
+            hand_i, hand_j = clips[i].hand_look, clips[j].hand_look
+            if hand_i is not None and hand_j is not None:
+                votes[i, j, (hand_j - hand_i) % n_looks] += _HAND_VOTES
+            votes[j, i] = votes[i, j][-np.arange(n_looks) % n_looks]
+        chosen = choose_looks(votes)
+        looks = list(chosen.looks)
+        names = [lens.camera.name for lens in lenses]
+        by_hand = sum(clip.hand_look is not None for clip in clips) > 1
+        evidence |= {
+            "decided_by": "matches of the scene" + (" and corners by hand" if by_hand else ""),
+            "matches_by_look": matches,
+            "margin_sigma": {
+                name: round(margin, 2)
+                for name, margin in zip(names, chosen.margins_sigma, strict=True)
+            },
+            "weakest_sigma": round(chosen.weakest_sigma, 2),
+            "is_weak": chosen.weakest_sigma < _WEAK_EVIDENCE,
+        }
+        log = logger.warning if evidence["is_weak"] else logger.info
+        log(
+            "the board looks the same turned by %d degrees; %s decide which way round each camera "
+            "saw it, by %.1f sigma at the weakest%s",
+            360 // n_looks,
+            evidence["decided_by"],
+            chosen.weakest_sigma,
+            ": uncertain; check the cameras' distances, mark the corners by hand in one order, or "
+            "use a board with an odd sum of columns and rows"
+            if evidence["is_weak"]
+            else "",
+        )
+    # The world turns with all cameras alike: the first order given by hand sets it, else the way
+    # in which the first camera sees columns run to the right.
+    turn = -looks[0]
+    for clip, look in zip(clips, looks, strict=True):
+        if clip.hand_look is not None:
+            turn = clip.hand_look - look
+            break
+    return [(look + turn) % n_looks for look in looks], evidence
+
+
+def _votes_of_scene(
+    board: Chessboard, lenses: Sequence[FittedLens], clips: Sequence[Clip]
+) -> tuple[NDArray[np.float64], dict[str, list[int]]]:
+    """Count the matches of the scene for each pair of cameras and each look."""
+    poses = [
+        _clip_pose(board, lens.camera, clip)[0] for lens, clip in zip(lenses, clips, strict=True)
+    ]
     scenes = [
-        describe_scene(lens.camera, pose, clip.picture, board)
+        describe_scene(lens.camera, pose, clip.picture, board) if clip.picture is not None else None
         for lens, pose, clip in zip(lenses, poses, clips, strict=True)
     ]
-    # votes[i, j, k]: matches for camera j being k looks ahead of camera i.
-    votes = np.zeros((n_cameras, n_cameras, n_looks))
-    pairs: dict[str, list[int]] = {}
-    for i, j in combinations(range(n_cameras), 2):
-        counts = count_agreeing(scenes[i], poses[i], scenes[j], poses[j], board)
-        votes[i, j] = counts
-        pairs[f"{lenses[i].camera.name} {lenses[j].camera.name}"] = counts.tolist()
-        hand_i, hand_j = clips[i].hand_look, clips[j].hand_look
-        if hand_i is not None and hand_j is not None:
-            votes[i, j, (hand_j - hand_i) % n_looks] += _HAND_VOTES
-        votes[j, i] = votes[i, j][-np.arange(n_looks) % n_looks]
-    looks = _vote(votes)
-    evidence: dict[str, Any] = {}
-    by_hand = sum(clip.hand_look is not None for clip in clips)
-    margins = {
-        lens.camera.name: _margin(votes, looks, {index}) for index, lens in enumerate(lenses)
-    }
-    margin = min(*margins.values(), *(_margin(votes, looks, side) for side in _sides(votes, looks)))
-    # The world turns with all cameras alike: the first order given by hand sets it, or the way in
-    # which the first camera sees columns run to the right.
-    turn = next(
-        (
-            (clip.hand_look - look) % n_looks
-            for clip, look in zip(clips, looks, strict=True)
-            if clip.hand_look is not None
-        ),
-        -looks[0] % n_looks,
-    )
-    looks = [(look + turn) % n_looks for look in looks]
-    evidence = {
-        "looks": n_looks,
-        "needed": True,
-        "decided_by": "scene matches" + (", corners given by hand" if by_hand > 1 else ""),
-        "matches_by_look": pairs,
-        "margin_sigma": {name: round(value, 2) for name, value in margins.items()},
-        "weakest_margin_sigma": round(margin, 2),
-        "is_weak": margin < _WEAK_EVIDENCE,
-    }
-    logger.info(
-        "the board looks the same turned by %d degrees: the scene around it decides, weakest "
-        "margin %.1f sigma",
-        360 // n_looks,
-        margin,
-    )
-    if margin < _WEAK_EVIDENCE:
-        logger.warning(
-            "which way round the cameras saw the board is uncertain (%.1f sigma): check the "
-            "cameras' distances, mark the corners by hand in one order, or use a board with an "
-            "odd sum of columns and rows",
-            margin,
+    votes = np.zeros((len(lenses), len(lenses), len(board.looks)))
+    matches = {}
+    for i, j in combinations(range(len(lenses)), 2):
+        first, second = scenes[i], scenes[j]
+        if first is not None and second is not None:
+            votes[i, j] = count_agreeing(first, poses[i], second, poses[j], board)
+        pair = f"{lenses[i].camera.name} {lenses[j].camera.name}"
+        matches[pair] = [int(count) for count in votes[i, j]]
+    return votes, matches
+
+
+def _clip_pose(board: Chessboard, camera: Camera, clip: Clip) -> tuple[Pose, float]:
+    """Return cam_from_board of a still clip, and how many times worse the other pose fits."""
+    located = locate_board(camera, board.points_board, clip.corners[0])
+    if located is None:
+        raise CalibrationError(
+            f"camera {camera.name!r}: the lens fitted to its stills cannot have seen the board "
+            "clip; were both recorded by this camera, with the same zoom?"
         )
-    return _Labelling(tuple(looks), evidence)
-
-
-def _lens_misses_clip(name: str) -> CalibrationError:
-    return CalibrationError(
-        f"camera {name!r}: the lens fitted to its stills cannot have seen the board clip; were "
-        "both recorded by this camera, with the same zoom?"
-    )
-
-
-# --- Everything at once ---------------------------------------------------------------------
+    return located[0], located[2] / max(located[1], 1e-9)
 
 
 def _adjust_all(
     board: Chessboard,
-    inputs: Sequence[CameraInput],
-    lenses: Sequence[_Lens],
-    clips: Sequence[_Clip],
-    stills: Sequence[_Stills],
-    labelling: _Labelling,
+    lenses: Sequence[FittedLens],
+    clips: Sequence[Clip],
     settings: CalibrationSettings,
-) -> Rig:
-    points = board.points_board
-    cameras, rig_from_board, common = link_cameras(
+) -> tuple[tuple[Camera, ...], Adjustment, list[BoardView], int]:
+    """Return cameras in the world, the adjustment, its views, and how many are of the clips."""
+    cameras, boards, views = link_cameras(
         board, [lens.camera for lens in lenses], [clip.corners for clip in clips]
     )
-    tilts = {}
-    for camera, clip in zip(cameras, clips, strict=True):
-        if clip.is_still:
-            located = locate_board(camera, points, clip.corners[0])
-            if located is None:
-                raise _lens_misses_clip(camera.name)
-            tilts[camera.name] = located[2] / max(located[1], 1e-9)
-            if tilts[camera.name] < _TILT_FACTOR:
-                logger.warning(
-                    "camera %s: the board clip hardly tells how the board is tilted (the other "
-                    "pose fits %.1f times worse); use a larger board or bring it nearer",
-                    camera.name,
-                    tilts[camera.name],
-                )
-    # Views of the board by single cameras follow the common frames.
-    views, n_common = list(common), len(common)
-    boards = dict(rig_from_board)
-    frame = max(boards) + 1
-    from_clip = "board clip, frame "
+    n_common = len(views)
+    common_frames = [view.frame for view in views]
+    of_clip = {(view.camera, _clip_view(view.frame)) for view in views}
+    frame = max(boards) + 1  # views of the board by single cameras follow the common frames
     for index, lens in enumerate(lenses):
-        for name, pixels, cam_from_board in lens.used:
-            if name.startswith(from_clip):
-                continue  # it is a view of a common frame already
-            views.append(BoardView(index, frame, pixels, name))
-            boards[frame] = compose(invert(cameras[index].cam_from_world), cam_from_board)
-            frame += 1
-    result = adjust(points, cameras, boards, views, settings.loss_px)
-    for index, camera in enumerate(result.cameras):
-        errors = [
-            rms(residuals)
-            for view, residuals in zip(views[:n_common], result.residuals_px, strict=False)
-            if view.camera == index
-        ]
-        worst = max(errors)
-        if worst > 5.0 * settings.max_view_px:
+        for name, (corners, cam_from_board) in lens.views.items():
+            if (index, name) not in of_clip:
+                views.append(BoardView(index, frame, corners, name))
+                boards[frame] = compose(invert(cameras[index].cam_from_world), cam_from_board)
+                frame += 1
+    result = adjust(board.points_board, cameras, boards, views, settings.loss_px)
+    for view, residuals in zip(views[:n_common], result.residuals_px, strict=False):
+        missed_px = rms(residuals)
+        if missed_px > _WRONG_CLIP_FACTOR * settings.max_view_px and clips[view.camera].is_still:
             raise CalibrationError(
-                f"camera {camera.name!r}: the board clip misses its lens by {worst:.1f} px; were "
-                "clip and stills recorded by this camera, with the same zoom, and is the board "
-                "the same?"
+                f"camera {cameras[view.camera].name!r}: the board clip misses its lens by "
+                f"{missed_px:.1f} px; were clip and stills recorded by this camera, with the same "
+                "zoom, and is the board the same?"
             )
     # The world: the board in the first of the frames that most cameras see.
-    seen = [view.frame for view in common]
-    world = max(sorted(set(seen)), key=lambda candidate: (seen.count(candidate), -candidate))
+    seen = Counter(common_frames)
+    world = max(sorted(seen), key=lambda common: (seen[common], -common))
     rig_from_world = result.rig_from_board[world]
     placed = tuple(
         replace(camera, cam_from_world=_orthonormal(compose(camera.cam_from_world, rig_from_world)))
@@ -766,15 +729,10 @@ def _adjust_all(
     for camera in placed:
         if camera.center_world[2] <= 0:
             raise CalibrationError(
-                f"camera {camera.name!r} came out under the floor ({camera.center_world[2]:.2f} m):"
-                " is its picture mirrored, or did it see another board?"
+                f"camera {camera.name!r} came out {-camera.center_world[2]:.2f} m under the floor: "
+                "is its picture mirrored, or did it see another board?"
             )
-    provenance = _provenance(
-        board, inputs, lenses, clips, stills, labelling, settings, views, n_common, result, placed
-    )
-    for name, tilt in tilts.items():
-        provenance["cameras"][name]["extrinsics"]["other_tilt_factor"] = round(tilt, 2)
-    return Rig(placed, provenance)
+    return placed, result, views, n_common
 
 
 def _orthonormal(pose: Pose) -> Pose:
@@ -784,11 +742,9 @@ def _orthonormal(pose: Pose) -> Pose:
 
 def _provenance(
     board: Chessboard,
-    inputs: Sequence[CameraInput],
-    lenses: Sequence[_Lens],
-    clips: Sequence[_Clip],
-    stills: Sequence[_Stills],
-    labelling: _Labelling,
+    observations: Sequence[Observations],
+    lenses: Sequence[FittedLens],
+    labelling: dict[str, Any],
     settings: CalibrationSettings,
     views: Sequence[BoardView],
     n_common: int,
@@ -799,38 +755,50 @@ def _provenance(
 
     def errors(indices: list[int]) -> dict[str, Any]:
         if not indices:
-            return {"rms_px": None, "max_px": None}
+            return {"views_used": 0, "rms_px": None, "max_px": None}
         residuals = np.concatenate([result.residuals_px[index] for index in indices])
-        lengths = np.linalg.norm(residuals, axis=1)
-        return {"rms_px": round(rms(residuals), 4), "max_px": round(float(lengths.max()), 3)}
+        worst = float(np.linalg.norm(residuals, axis=1).max())
+        return {
+            "views_used": len(indices),
+            "rms_px": round(rms(residuals), 4),
+            "max_px": round(worst, 3),
+        }
 
     cameras: dict[str, dict[str, Any]] = {}
-    for index, (given, lens, clip, still) in enumerate(
-        zip(inputs, lenses, clips, stills, strict=True)
-    ):
+    for index, (seen, lens, camera) in enumerate(zip(observations, lenses, placed, strict=True)):
         own = [i for i, view in enumerate(views) if view.camera == index and i >= n_common]
         common = [i for i, view in enumerate(views) if view.camera == index and i < n_common]
-        cameras[given.name] = {
-            "model": given.model,
-            "intrinsics": {
-                "source": given.intrinsics.label if given.intrinsics else None,
-                **errors(own),
-                "views_used": len(own),
-                "views_dropped": lens.dropped,
-                "views_without_board": still.missed,
-            },
-            "extrinsics": {
-                "source": given.extrinsics.label if given.extrinsics else None,
-                **errors(common),
-                "views_used": len(common),
-                "how": clip.how,
-                "spread_over_clip_px": (
-                    None if clip.spread_px is None else round(clip.spread_px, 4)
-                ),
-            },
-            "center_m": [round(float(value), 4) for value in placed[index].center_world],
+        clip = seen.clip
+        extrinsics = {
+            "source": seen.sources.get("extrinsics"),
+            "corners_by_hand": seen.sources.get("corners"),
+            **errors(common),
+            "how": clip.how,
         }
-    total = np.concatenate(result.residuals_px)
+        if clip.spread_px is not None and np.isfinite(clip.spread_px):
+            extrinsics["spread_over_clip_px"] = round(clip.spread_px, 4)
+        if clip.is_still:
+            tilt = _clip_pose(board, camera, clip)[1]
+            extrinsics["other_tilt_times_worse"] = round(min(tilt, 1e6), 2)
+            if tilt < _TILT_FACTOR:
+                logger.warning(
+                    "camera %s: the board clip hardly tells how the board is tilted (the other "
+                    "tilt fits %.1f times worse); use a larger board or bring it nearer",
+                    camera.name,
+                    tilt,
+                )
+        cameras[seen.name] = {
+            "model": seen.model,
+            "center_m": [round(float(value), 4) for value in camera.center_world],
+            "intrinsics": {
+                "source": seen.sources.get("intrinsics"),
+                **errors(own),
+                "views_dropped": lens.dropped,
+                "views_without_board": seen.stills.missed,
+            },
+            "extrinsics": extrinsics,
+        }
+    is_still = all(seen.clip.is_still for seen in observations)
     return {
         "method": "chessboard; joint bundle adjustment of lenses, poses and boards (pycolmap)",
         "software": {
@@ -838,14 +806,11 @@ def _provenance(
             for name in ("pycolmap", "opencv-python-headless")
         },
         "board": asdict(board),
-        "world": (
-            "the board in the still clip"
-            if clips[0].is_still
-            else "the board in one frame of the clip"
-        )
-        + "; Z up, away from its printed side; the origin is its first inner corner",
-        "rms_px": round(rms(total), 4),
+        "world": "the board as it lies in the clip"
+        if is_still
+        else "the board in the first frame that most cameras see",
+        "rms_px": round(rms(np.concatenate(result.residuals_px)), 4),
         "cameras": cameras,
-        "labelling": labelling.evidence,
+        "labelling": labelling,
         "settings": asdict(settings),
     }

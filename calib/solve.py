@@ -9,7 +9,7 @@ This work is based on: Zhang, *A flexible new technique for camera calibration*,
 Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle adjustment: a modern synthesis*, 2000.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -27,6 +27,13 @@ pycolmap.logging.minloglevel = 2  # errors only: what matters is raised or repor
 
 #: Focal lengths tried as seeds, as shares of the longer image side: 150 to 12 degrees of view.
 _FOCAL_SEEDS = np.geomspace(0.25, 5.0, 25)
+
+#: Views from which the focal length is seeded: more do not change it, and each is located once
+#: for every focal length tried.
+_SEED_VIEWS = 12
+
+#: Turns of fitting and dropping; a handful is usual.
+_MAX_TURNS = 50
 
 #: The adjustment has converged when the gradient is below this (pixels squared a unit); the
 #: default of 1e-4 stops at a relative error of about 1e-5 on noise-free corners.
@@ -187,6 +194,117 @@ def seed_camera(
             "check the board's columns and rows, or choose another model"
         )
     return best
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedLens:
+    """A camera's lens and the views it was fitted to.
+
+    Attributes
+    ----------
+    camera : Camera
+        The lens; its pose is the identity.
+    views : dict of str to ((N, 2) float64, (3, 4) float64)
+        By name the corners that were used, pixels, and cam_from_board of that view.
+    dropped : dict of str to str
+        Views that do not fit, and why.
+    """
+
+    camera: Camera
+    views: dict[str, tuple[NDArray[np.float64], Pose]]
+    dropped: dict[str, str]
+
+
+def fit_lens(
+    points_board: NDArray[np.float64],
+    name: str,
+    model: str,
+    size_px: tuple[int, int],
+    views: dict[str, NDArray[np.float64]],
+    limit_px: Callable[[Sequence[float]], float],
+    min_views: int,
+    loss_px: float,
+) -> FittedLens:
+    """Fit one camera's lens to views of a board, and drop views by their own error.
+
+    The worst views go first, a fifth at a time, since a wrong view spoils the error of the
+    others; after each turn all are asked again, also those that had gone.
+
+    Parameters
+    ----------
+    points_board : (N, 3) float64
+        Corners of the board in metres.
+    name, model : str
+        As in `Camera`.
+    size_px : (width, height)
+        Of the images.
+    views : dict of str to (N, 2) float64
+        By name the corners in pixels.
+    limit_px : callable
+        From the root mean square errors of the views used to the largest that is accepted.
+    min_views : int
+        How many views must fit.
+    loss_px : float
+        As in `adjust`.
+
+    Raises
+    ------
+    CalibrationError
+        If fewer views fit.
+    """
+    names, corners = list(views), list(views.values())
+    chosen = np.linspace(0, len(names) - 1, min(len(names), _SEED_VIEWS)).round().astype(int)
+    lens = seed_camera(name, model, size_px, points_board, [corners[index] for index in chosen])
+    kept = set(range(len(names)))
+    boards: dict[int, Pose] = {}
+    reasons: dict[int, str] = {}
+    is_rough = True  # the seed is: first leave the principal point in the middle
+    for _ in range(_MAX_TURNS):
+        for index in sorted(kept - boards.keys()):
+            located = locate_board(lens, points_board, corners[index])
+            if located is not None:
+                boards[index] = located[0]
+        used = sorted(kept & boards.keys())
+        if len(used) < min_views:
+            raise CalibrationError(
+                f"camera {name!r}: only {len(used)} of {len(names)} views of the board fit model "
+                f"{model}, expected {min_views} or more; check columns and rows, take sharper "
+                "pictures, or choose another model"
+            )
+        result = adjust(
+            points_board,
+            [lens],
+            {index: boards[index] for index in used},
+            [BoardView(0, index, corners[index], names[index]) for index in used],
+            loss_px,
+            fix_principal_point=is_rough,
+        )
+        lens = result.cameras[0]
+        boards.update(result.rig_from_board)
+        if is_rough:
+            is_rough = False
+            continue
+        errors = dict(zip(used, map(rms, result.residuals_px), strict=True))
+        limit = limit_px(list(errors.values()))
+        for index in sorted(set(range(len(names))) - set(used)):
+            located = locate_board(lens, points_board, corners[index])
+            if located is not None:
+                errors[index], boards[index] = located[1], located[0]
+        bad = sorted((i for i in used if errors[i] > limit), key=lambda i: -errors[i])
+        bad = bad[: max(1, len(used) // 5)]
+        good = {i for i in errors if errors[i] <= limit or (i in used and i not in bad)}
+        for index in set(range(len(names))) - good:
+            reasons[index] = "the lens sees no ray at some corner"
+            if index in errors:
+                reasons[index] = f"{errors[index]:.2f} px rms, limit {limit:.2f} px"
+        if good == kept:
+            break
+        kept = good
+    return FittedLens(
+        lens,
+        {names[index]: (corners[index], boards[index]) for index in used},
+        {names[index]: reasons[index] for index in range(len(names)) if index not in used},
+    )
 
 
 def adjust(
