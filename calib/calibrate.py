@@ -275,6 +275,49 @@ def observe_board(
     ]
 
 
+def find_board(
+    board: Chessboard,
+    cameras: list[CameraInput],
+    settings: CalibrationSettings = _DEFAULTS,
+    progress: Progress | None = None,
+) -> dict[str, NDArray[np.float64]]:
+    """Find the board's corners where all cameras see it at once, to check a rig made elsewhere.
+
+    Parameters
+    ----------
+    board : Chessboard
+        The board.
+    cameras : list of CameraInput
+        The cameras; those without extrinsics are left out.
+    settings : CalibrationSettings
+        How it is done.
+    progress : callable, optional
+        Called with what is being done, how many of it are done, and how many there are.
+
+    Returns
+    -------
+    dict of str to (N, 2) float64
+        By camera the corners in pixels, of the averaged clip if the board lies still in it, else
+        of the frame in which most cameras see it.
+
+    Raises
+    ------
+    CalibrationError
+        Naming the camera, and what was tried, where no board is found.
+    """
+    report = progress or _no_progress
+    seeing = [camera for camera in cameras if camera.extrinsics is not None]
+    with ThreadPoolExecutor(settings.threads or os.cpu_count() or 1) as pool:
+        clips = _observe_clips(board, seeing, settings, pool, report)
+    frames = {frame for clip in clips for frame in clip.corners}
+    best = max(sorted(frames), key=lambda frame: sum(frame in clip.corners for clip in clips))
+    return {
+        camera.name: clip.corners[best]
+        for camera, clip in zip(seeing, clips, strict=True)
+        if best in clip.corners
+    }
+
+
 def _no_progress(what: str, done: int, total: int) -> None:
     del what, done, total
 
