@@ -12,6 +12,7 @@ from hybridve.hull.capture.recording import (
     segmented_frames,
     undistort_mask,
 )
+from hybridve.hull.consistency import drop_unconfirmed
 from hybridve.hull.contact.detect import Contact, detect_contacts
 from hybridve.hull.evaluate import Chain
 from hybridve.hull.query.engine import Engine
@@ -37,7 +38,7 @@ class Shot:
     index : int
         Number of the frame.
     masks : list of (H, W) uint8
-        Silhouettes in the images as recorded.
+        Silhouettes in the images as recorded, without pieces that no other camera confirms.
     hull : Hull
         The frame's hull.
     contacts : list of Contact
@@ -62,12 +63,13 @@ def take_shot(chain: Chain, index: int, engine: Engine) -> Shot:
     for frame in segmented_frames(chain.session, FrameRange(index, index + 1)):
         if frame.masks is None:
             raise SessionError(f"{chain.session.path}: frame {index}: {frame.reason}")
+        masks = drop_unconfirmed(chain.views, chain.undistortions, frame.masks)
         undistorted = [
             undistort_mask(mask, lens)
-            for mask, lens in zip(frame.masks, chain.undistortions, strict=True)
+            for mask, lens in zip(masks, chain.undistortions, strict=True)
         ]
         hull = make_hull(chain.views, undistorted)
-        return Shot(chain, index, frame.masks, hull, detect_contacts(hull, chain.bodies, engine))
+        return Shot(chain, index, masks, hull, detect_contacts(hull, chain.bodies, engine))
     raise SessionError(f"{chain.session.path}: the recording has no frame {index}")
 
 
