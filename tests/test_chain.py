@@ -1,0 +1,93 @@
+"""The whole job on a generated recording, command by command, against what is true of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hybridve.calib.pose import angle_between
+from hybridve.calib.rig_io import read_rig
+from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.capture.synth import read_truth, true_masks
+from hybridve.hull.report.read import read_report
+
+Run = Callable[..., int]
+
+#: Contacts shallower than this may be missed: what calibration and silhouettes leave open, metres.
+SHALLOW_M = 0.003
+
+N_FRAMES = 16
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A generated session, calibrated, segmented, its collisions detected and drawn."""
+    from click.testing import CliRunner
+
+    from hybridve.cli.main import cli
+
+    folder = tmp_path_factory.mktemp("chain")
+    session, report = folder / "session", folder / "report.h5"
+    scene = session / "scene.toml"
+    for command in (
+        ["synth", "boxes", "-o", session, "--n-frames", N_FRAMES],
+        ["calibrate", session],
+        ["segment", session],
+        ["detect", session, "--scene", scene, "-o", report, "--accuracy-mm", "4"],
+    ):
+        CliRunner().invoke(cli, [str(part) for part in command], catch_exceptions=False)
+    return folder
+
+
+def test_the_rig_is_found_to_a_few_millimetres(folder: Path) -> None:
+    truth = read_truth(folder / "session")
+    rig = read_rig(folder / "session" / "rig" / "rig.json")
+
+    for camera in truth.cameras:
+        found = rig[camera.name]
+        # Five times what was measured (1.4 mm, 0.55 mrad): corners are found to 0.02 px.
+        assert np.linalg.norm(found.center_world - camera.center_world) < 0.007
+        assert angle_between(found.cam_from_world, camera.cam_from_world) < 0.003
+
+
+def test_silhouettes_cover_what_is_there(folder: Path) -> None:
+    with SilhouetteReader(folder / "session" / "silhouettes.h5") as reader:
+        for frame in range(0, N_FRAMES, 5):
+            masks, _ = reader.frame(frame)
+            assert masks is not None
+            truth = true_masks(folder / "session", frame)
+            for name, mask in zip(reader.names, masks, strict=True):
+                true, found = truth[name] > 0, mask > 0
+                assert (true & found).sum() / (true | found).sum() > 0.85, (frame, name)
+
+
+def test_every_true_collision_is_found_and_what_is_far_is_free(folder: Path) -> None:
+    truth = read_truth(folder / "session")
+    report = read_report(folder / "report.h5")
+    n_true = 0
+
+    for name, rows in report.objects.items():
+        true = truth.objects[name]
+        deep = true.penetration_m > SHALLOW_M
+        assert rows.collides[deep].all(), name
+        n_true += int(deep.sum())
+        # The hull bulges, but not by 4 cm between four cameras.
+        assert not rows.collides[true.clearance_m > 0.04].any(), name
+    assert n_true >= 4, "the recording would prove too little"
+    assert (report.objects["shelf"].certificate == "free").all()
+
+
+def test_the_pictures_show_the_collision_in_red(run: Run, folder: Path) -> None:
+    session, report = folder / "session", folder / "report.h5"
+    arguments = [session, "--scene", session / "scene.toml", "--report", report]
+
+    for view in ("scene", "cameras"):
+        path = folder / f"{view}.png"
+        assert run("render", *arguments, "-o", path, "--view", view) == 0
+
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        blue, green, red = picture.astype(int).transpose(2, 0, 1)
+        assert ((red > 170) & (green < 60) & (blue < 60)).sum() > 200
