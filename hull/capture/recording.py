@@ -66,7 +66,7 @@ class FrameSilhouettes:
     reason : str
         Why `masks` is None; else empty.
     decode_s, segment_s : float
-        Seconds of work, summed over the cameras, which run side by side.
+        Seconds of processor time, summed over the cameras, which run side by side.
     """
 
     index: int
@@ -377,9 +377,9 @@ class _Lane(threading.Thread):
         images = self._source.frames_or_errors(first - shift, stop, frames.step)
         shape: tuple[int, ...] | None = None
         while True:
-            started = time.perf_counter()
+            started = time.thread_time()
             image = next(images, None)
-            decoded = time.perf_counter()
+            decoded = time.thread_time()
             if image is None:
                 return
             if isinstance(image, SessionError):
@@ -397,7 +397,7 @@ class _Lane(threading.Thread):
             mask = self._cut(image)
             if self._undistortion is not None:
                 mask = undistort_mask(mask, self._undistortion)
-            yield _Cut(mask, "", decoded - started, time.perf_counter() - decoded)
+            yield _Cut(mask, "", decoded - started, time.thread_time() - decoded)
 
 
 def _side_by_side(
