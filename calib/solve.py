@@ -105,7 +105,10 @@ def board_residuals(
 
 
 def locate_board(
-    camera: Camera, points_board: NDArray[np.float64], pixels: NDArray[np.float64]
+    camera: Camera,
+    points_board: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    refine: bool = True,
 ) -> tuple[Pose, float, float] | None:
     """Return where a flat board lies as one camera sees it.
 
@@ -117,6 +120,8 @@ def locate_board(
         Corners in metres, z = 0.
     pixels : (N, 2) float64
         The same corners in the image.
+    refine : bool
+        Least squares after the closed form, on rays.
 
     Returns
     -------
@@ -139,9 +144,10 @@ def locate_board(
         return None
     poses = []
     for rotation, translation in zip(rotations, translations, strict=True):
-        rotation, translation = cv2.solvePnPRefineLM(
-            points_board - center, rays, np.eye(3), None, rotation, translation
-        )
+        if refine:
+            rotation, translation = cv2.solvePnPRefineLM(
+                points_board - center, rays, np.eye(3), None, rotation, translation
+            )
         matrix = cv2.Rodrigues(rotation)[0]
         pose = np.column_stack([matrix, translation.ravel() - matrix @ center])
         error_px = rms(board_residuals(camera, pose, points_board, pixels))
@@ -183,7 +189,7 @@ def seed_camera(
             1, model, share * max(size_px), width_px, height_px
         )
         camera = Camera(name, model, width_px, height_px, lens.params, np.eye(3, 4))
-        located = [locate_board(camera, points_board, pixels) for pixels in views]
+        located = [locate_board(camera, points_board, pixels, False) for pixels in views]
         # The median: blurred and wrong views have not been dropped yet.
         error = float(np.median([np.inf if found is None else found[1] for found in located]))
         if error < best_error:

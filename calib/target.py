@@ -394,8 +394,8 @@ def _refine(
 ) -> NDArray[np.float64] | None:
     # Corners that were clicked or found on the wrong pixel are first drawn onto the smooth grid
     # through all of them, so that each starts nearer to its place than to the middle of a square,
-    # which has the same symmetry. Each turn sees the board a little more frontally.
-    for may_be_rough in (True, True, False):
+    # which has the same symmetry. At first blur widens the slopes that show the way.
+    for may_be_rough, blur in ((True, 0.15), (True, 0.0), (False, 0.0)):
         frontal = _frontal(grey, board, corners)
         if frontal is None:
             return None
@@ -407,13 +407,13 @@ def _refine(
         height, width = view.shape
         if (start < 2).any() or (start > (width - 3, height - 3)).any():
             return None
-        moved = _symmetric(view, start, cell)
+        moved = _symmetric(view, start, cell, max(blur * cell, _SYMMETRY_BLUR_PX))
         corners = _mapped(img_from_view, moved) + 0.5
     return corners if _roughness(board, corners) < _ROUGH_TOLERANCE else None
 
 
 def _symmetric(
-    view: NDArray[np.float32], start: NDArray[np.float64], cell: float
+    view: NDArray[np.float32], start: NDArray[np.float64], cell: float, blur_px: float
 ) -> NDArray[np.float64]:
     """Move points (N, 2) to where the view looks the same when turned by 180 degrees.
 
@@ -427,7 +427,7 @@ def _symmetric(
     offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     offsets = offsets[: len(offsets) // 2]  # (K, 2): one of each opposite pair
     window = np.exp(-0.5 * (offsets / (0.6 * reach)) ** 2).prod(axis=1)
-    smooth = cv2.GaussianBlur(view, (0, 0), _SYMMETRY_BLUR_PX)
+    smooth = cv2.GaussianBlur(view, (0, 0), blur_px)
     slope_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     slope_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
 
