@@ -1,0 +1,46 @@
+"""What is drawn beside the hull: CAD objects and what of them collides."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnObject:
+    """A CAD object as it stands in one frame.
+
+    Attributes
+    ----------
+    name : str
+        Shown beside it.
+    vertices_world : (V, 3) float64
+        Metres.
+    faces : (T, 3) int32
+        Vertex numbers.
+    collides : bool
+        Whether it is drawn as colliding.
+    hit_triangles : (K,) uint32
+        Numbers of the triangles with collision points.
+    hit_points_world : (P, 3) float32
+        The collision points, in metres.
+    """
+
+    name: str
+    vertices_world: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    collides: bool
+    hit_triangles: NDArray[np.uint32]
+    hit_points_world: NDArray[np.float32]
+
+    @property
+    def corners_world(self) -> NDArray[np.float64]:
+        """The vertices of each triangle, (T, 3, 3) metres."""
+        return self.vertices_world[self.faces]
+
+
+def thinned(points: NDArray[np.float64], spacing: float) -> NDArray[np.int64]:
+    """Return numbers of points (N, D), one in each cell of `spacing`; so that dots stay dots."""
+    cells = np.floor(points / spacing).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    return np.sort(first)

@@ -1,0 +1,45 @@
+#version 430 core
+
+// # CAD objects: depth, normal, and which part is inside the hull
+//
+// Every pixel of a colliding object asks the hull: the volume query at the resolution of the
+// picture, whatever the size of the triangle.
+//
+// ## Resources
+//
+// Those of hull.common.glsl, and
+//
+// | output | name   | type | unit, frame                                                      |
+// |--------|--------|------|------------------------------------------------------------------|
+// | 0      | depth  | R32F | metres along `forward`                                           |
+// | 1      | normal | vec4 | towards the eye, local frame; w = kind                           |
+//
+// Kinds, the same in hull/view/paint.py: 1 free, 2 of an object that collides, 3 a triangle with
+// collision points, 4 inside the hull.
+
+// INSERT
+
+in vec3 mesh_point;
+flat in float mesh_kind;
+
+layout(location = 0) out float depth;
+layout(location = 1) out vec4 normal;
+
+uniform vec3 eye, forward;
+uniform bool parallel;
+uniform vec3 box_low, box_high;  // contains the hull, metres, local frame
+uniform bool inside_only;   // draw nothing but what is inside the hull
+
+void main() {
+    float kind = mesh_kind;
+    bool near_hull = all(greaterThan(mesh_point, box_low)) && all(lessThan(mesh_point, box_high));
+    if (kind > 1.5 && near_hull && hull_contains(mesh_point)) kind = 4.0;
+    if (inside_only && kind < 3.5) discard;
+
+    vec3 across = cross(dFdx(mesh_point), dFdy(mesh_point));
+    float size = length(across);
+    vec3 towards_eye = parallel ? -forward : normalize(eye - mesh_point);
+    vec3 n = size > 0.0 ? across / size : towards_eye;
+    depth = dot(mesh_point - eye, forward);
+    normal = vec4(dot(n, towards_eye) < 0.0 ? -n : n, kind);
+}

@@ -1,0 +1,17 @@
+#version 430 core
+
+// # CAD objects: from the local frame to the picture
+
+in vec3 point;   // metres, local frame
+in float kind;   // see mesh.frag.glsl
+
+uniform mat4 clip_from_local;
+
+out vec3 mesh_point;
+flat out float mesh_kind;
+
+void main() {
+    mesh_point = point;
+    mesh_kind = kind;
+    gl_Position = clip_from_local * vec4(point, 1.0);
+}
