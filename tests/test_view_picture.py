@@ -1,0 +1,312 @@
+"""Pictures: who obscures whom, what is red, and what is written."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.hulls import ring_views
+from helpers.view_scene import (
+    BALL_RADIUS_M,
+    HEIGHT_PX,
+    WIDTH_PX,
+    ball_scene,
+    box,
+    is_blue_grey,
+    is_red,
+    is_warm_grey,
+    pixels_of,
+    ring_rig,
+    touched_box,
+    view_from,
+)
+
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import ReportError
+from hybridve.calib.lens import project_points
+from hybridve.calib.rig import Rig
+from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.view.picture import (
+    choose_viewpoint,
+    contact_sheet,
+    draw_overlay,
+    draw_picture,
+    write_picture,
+)
+
+pytestmark = pytest.mark.gl
+
+SIZE_PX = (320, 200)
+
+#: The middle of the picture, where the viewpoints below look at the ball. No text stands there.
+MIDDLE = (slice(90, 110), slice(150, 170))
+
+#: Share of these pixels that has the colour of what is seen: axes and their names pass before it.
+MOST = 0.75
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Hull, Rig]:
+    return ball_scene()
+
+
+def empty_hull() -> Hull:
+    views = ring_views(4)
+    return make_hull(views, [np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)] * 4)
+
+
+def test_the_hull_stands_in_the_middle(scene: tuple[Hull, Rig]) -> None:
+    image = draw_picture(*scene, [], viewpoint=view_from(3, -2, 1.5), size_px=SIZE_PX)
+
+    assert image.shape == (200, 320, 3)
+    assert image.dtype == np.uint8
+    assert is_warm_grey(image[MIDDLE]).mean() > MOST
+
+
+def test_an_object_in_front_hides_the_hull(scene: tuple[Hull, Rig]) -> None:
+    front = box("front", (1.0, 0.0, 0.0), 0.4)
+
+    image = draw_picture(*scene, [front], viewpoint=view_from(4, 0, 0), size_px=SIZE_PX)
+
+    assert is_blue_grey(image[MIDDLE]).mean() > MOST
+
+
+def test_the_hull_hides_an_object_behind(scene: tuple[Hull, Rig]) -> None:
+    behind = box("behind", (-1.0, 0.0, 0.0), 0.4)
+
+    image = draw_picture(*scene, [behind], viewpoint=view_from(4, 0, 0), size_px=SIZE_PX)
+
+    assert is_warm_grey(image[MIDDLE]).mean() > MOST
+
+
+def test_an_object_half_in_the_hull_is_cut_by_its_surface(scene: tuple[Hull, Rig]) -> None:
+    """A long bar through the ball: seen beside it, hidden in it."""
+    bar = box("bar", (0.0, 0.0, 0.0), (0.1, 1.4, 0.1))
+
+    image = draw_picture(*scene, [bar], viewpoint=view_from(4, 0, 0), size_px=SIZE_PX)
+
+    assert is_warm_grey(image[MIDDLE]).mean() > MOST
+    middle_row = image[100]
+    # The ball spans 0.8 of the bar's 1.4 m; perspective and rims cost a little.
+    assert is_blue_grey(middle_row).sum() > 0.3 * is_warm_grey(middle_row).sum()
+
+
+def test_what_touches_is_red_and_what_is_free_is_not(scene: tuple[Hull, Rig]) -> None:
+    """A box dips into the ball; the same box is drawn as if it were free."""
+    view = view_from(3, 1.5, 1.5)
+    touched = touched_box("box", scene[0], (0.35, 0.2, 0.2))
+    free = box("box", (0.35, 0.2, 0.2), 0.3)
+
+    red = is_red(draw_picture(*scene, [touched], viewpoint=view, size_px=SIZE_PX))
+    none = is_red(draw_picture(*scene, [free], viewpoint=view, size_px=SIZE_PX))
+
+    # The world's x axis and the legend are drawn in red too: only the middle counts.
+    assert red[50:150, 110:210].sum() > 50
+    assert none[50:150, 110:210].sum() == 0
+
+
+def test_touching_triangles_shine_through_the_hull(scene: tuple[Hull, Rig]) -> None:
+    inside = touched_box("inside", scene[0], (0.0, 0.0, 0.0))
+
+    image = draw_picture(*scene, [inside], viewpoint=view_from(4, 0, 0), size_px=SIZE_PX)
+
+    red, blue = (image[MIDDLE][..., channel].astype(int) for channel in (2, 0))
+    assert (red > 1.3 * blue).mean() > 0.7  # collision points and edges are darker
+
+
+def test_an_empty_hull_is_drawn(scene: tuple[Hull, Rig]) -> None:
+    _, rig = scene
+    image = draw_picture(empty_hull(), rig, [box("alone", (0, 0, 0))], size_px=SIZE_PX)
+
+    assert is_blue_grey(image).sum() > 100
+
+
+def test_nothing_but_cameras_is_drawn(scene: tuple[Hull, Rig]) -> None:
+    image = draw_picture(empty_hull(), scene[1], [], size_px=SIZE_PX)
+
+    assert image.std() > 1
+
+
+def test_an_object_around_the_viewer_is_cut_where_it_passes_behind(
+    scene: tuple[Hull, Rig],
+) -> None:
+    """A slab from in front of the viewer to behind: its front end hides the ball."""
+    slab = box("slab", (3.0, 0.0, 0.4), (4.0, 2.0, 0.02))
+
+    image = draw_picture(*scene, [slab], viewpoint=view_from(4, 0, 0), size_px=SIZE_PX)
+
+    assert is_blue_grey(image[24:48, 120:180]).mean() > MOST
+    assert is_warm_grey(image[MIDDLE]).mean() > MOST
+
+
+def test_title_and_caption_stand_above(scene: tuple[Hull, Rig]) -> None:
+    view = view_from(3, -2, 1.5)
+    without = draw_picture(*scene, [], viewpoint=view, size_px=SIZE_PX)
+    with_text = draw_picture(
+        *scene, [], viewpoint=view, size_px=SIZE_PX, title="Frame 7", caption="nothing is touched"
+    )
+
+    changed = (without != with_text).any(axis=2)
+    assert changed[:24].any()
+    assert not changed[24:].any()
+
+
+def test_the_chosen_view_shows_what_touches(scene: tuple[Hull, Rig]) -> None:
+    """The touching side faces away from the x axis: the view goes there."""
+    hull, rig = scene
+    touching = box("left", (-0.45, 0.0, 0.0), 0.2, hits=(8, 9))  # the faces at smallest x
+
+    viewpoint = choose_viewpoint(hull, rig, [touching])
+
+    assert viewpoint.eye_world[0] < -0.5
+    assert viewpoint.eye_world[2] > 0
+
+
+def test_the_chosen_view_holds_hull_and_objects(scene: tuple[Hull, Rig]) -> None:
+    hull, rig = scene
+    far = box("far", (1.5, 1.0, 0.0))
+
+    viewpoint = choose_viewpoint(hull, rig, [far])
+
+    ball = BALL_RADIUS_M * np.concatenate([np.eye(3), -np.eye(3)])
+    for points in (far.vertices_world, ball):
+        pixels = pixels_of(viewpoint, points, (1600, 1000))
+        assert ((pixels > 0) & (pixels < (1600, 1000))).all()
+
+
+def bent_camera() -> Camera:
+    """Return a camera at the origin that looks along z through a lens that bends inwards."""
+    return Camera(
+        "bent",
+        "OPENCV",
+        640,
+        480,
+        np.array([500.0, 500.0, 320.0, 240.0, -0.25, 0.05, 0.0, 0.0]),
+        np.eye(3, 4),
+    )
+
+
+def test_the_overlay_puts_the_object_where_the_lens_puts_it() -> None:
+    camera = bent_camera()
+    drawn = box("aside", (0.9, 0.5, 2.0), 0.2)
+    grey = np.full((480, 640, 3), 128, np.uint8)
+
+    image = draw_overlay(grey, camera, np.zeros((480, 640), np.uint8), [drawn])
+
+    changed = (image != 128).any(axis=2)
+    changed[:60, :160] = False  # the camera's name
+    pixels, _ = project_points(camera, drawn.vertices_world)
+    rows, columns = np.nonzero(changed)
+    # The rim is drawn a pixel to either side.
+    assert columns.min() == pytest.approx(pixels[:, 0].min(), abs=2)
+    assert columns.max() == pytest.approx(pixels[:, 0].max(), abs=2)
+    assert rows.min() == pytest.approx(pixels[:, 1].min(), abs=2)
+    assert rows.max() == pytest.approx(pixels[:, 1].max(), abs=2)
+
+
+def test_the_overlay_bends_a_long_straight_edge() -> None:
+    """A bar across the image is drawn where the lens puts its middle and its ends."""
+    camera = bent_camera()
+    bar = box("bar", (0.0, 0.6, 2.0), (2.0, 0.02, 0.02))
+    grey = np.full((480, 640, 3), 128, np.uint8)
+
+    image = draw_overlay(grey, camera, np.zeros((480, 640), np.uint8), [bar])
+
+    expected, _ = project_points(camera, np.array([[0.0, 0.6, 2.0], [0.9, 0.6, 2.0]]))
+    for column, row in expected:
+        rows = np.flatnonzero((image[:, int(column)] != 128).any(axis=1))
+        assert abs(rows.mean() - row) < 4  # the bar is 5 px thick
+    assert abs(expected[0, 1] - expected[1, 1]) > 5, "the lens bends too little to tell"
+
+
+def test_the_overlay_leaves_out_what_is_behind_the_camera() -> None:
+    grey = np.full((480, 640, 3), 128, np.uint8)
+    silhouette = np.zeros((480, 640), np.uint8)
+
+    behind = draw_overlay(grey, bent_camera(), silhouette, [box("behind", (0, 0, -2.0))])
+    nothing = draw_overlay(grey, bent_camera(), silhouette, [])
+
+    np.testing.assert_array_equal(behind, nothing)
+
+
+def test_the_overlay_shows_silhouette_and_collision() -> None:
+    grey = np.full((480, 640, 3), 128, np.uint8)
+    silhouette = np.zeros((480, 640), np.uint8)
+    cv2.circle(silhouette, (320, 240), 100, 255, -1)
+    touched = box("touched", (0, 0, 2.0), hits=tuple(range(12)))
+    free = box("free", (0, 0, 2.0))
+
+    image = draw_overlay(grey, bent_camera(), silhouette, [touched])
+
+    blue, green, red = (image[240, 218:223, channel].astype(int) for channel in range(3))
+    assert (green > np.maximum(red, blue) + 40).any(), "the outline passes here"
+    middle = (slice(235, 245), slice(315, 325))
+    plain = draw_overlay(grey, bent_camera(), silhouette, [free])
+    assert (image[middle][..., 2] > 1.3 * image[middle][..., 0]).mean() > MOST
+    assert (plain[middle][..., 2] < plain[middle][..., 0]).all()
+
+
+def test_a_contact_sheet_holds_pictures_of_unequal_size() -> None:
+    small = np.full((40, 60, 3), 10, np.uint8)
+    large = np.full((80, 120, 3), 200, np.uint8)
+
+    sheet = contact_sheet([small, large, small], columns=2)
+
+    assert sheet.shape[0] >= 160
+    assert sheet.shape[1] >= 240
+    assert (sheet == 200).all(axis=2).sum() == 80 * 120
+    rows, columns = np.nonzero((sheet == 10).all(axis=2))
+    assert len(rows) >= 2 * 40 * 60
+    # One left of the large picture, one in the row below it.
+    large_rows, large_columns = np.nonzero((sheet == 200).all(axis=2))
+    assert columns.max() < large_columns.min()
+    assert rows.max() > large_rows.max()
+
+
+def test_a_picture_is_read_back(tmp_path: Path) -> None:
+    image = np.arange(30 * 40 * 3, dtype=np.uint8).reshape(30, 40, 3)
+    path = tmp_path / "picture.png"
+
+    write_picture(path, image)
+
+    np.testing.assert_array_equal(cv2.imread(str(path)), image)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["picture.png"]
+
+
+@pytest.mark.parametrize("name", ["missing/picture.png", "picture.xyz", "picture", "file/a.png"])
+def test_an_unwritable_picture_is_named_and_leaves_nothing(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("in the way")
+    path = tmp_path / name
+
+    with pytest.raises(ReportError, match=path.name):
+        write_picture(path, np.zeros((4, 4, 3), np.uint8))
+
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_picture_does_not_replace_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "picture.png"
+    folder.mkdir()
+
+    with pytest.raises(ReportError, match=r"picture\.png"):
+        write_picture(folder, np.zeros((4, 4, 3), np.uint8))
+
+    assert [entry.name for entry in tmp_path.iterdir()] == ["picture.png"]
+
+
+def test_importing_pictures_loads_no_mesh_library() -> None:
+    code = "import sys, hybridve.hull.view.picture; print('open3d' in sys.modules)"
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert answer.stdout.strip() == "False"
+
+
+def test_rings_of_test_cameras_are_what_they_seem(scene: tuple[Hull, Rig]) -> None:
+    """The rig drawn is the rig that saw the hull."""
+    views = ring_views(6)
+    rig = ring_rig(views)
+    pixels = [project_points(camera, np.zeros((1, 3)))[0] for camera in rig.cameras]
+    np.testing.assert_allclose(np.concatenate(pixels), [[360.0, 243.0]] * 6, atol=1e-6)
