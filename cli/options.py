@@ -16,7 +16,7 @@ FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
 _path = click.Path(path_type=Path)
 
 
-class _Frames(click.ParamType):
+class _Frames(click.ParamType["FrameRange"]):
     name = "START:STOP[:STEP]"
 
     def convert(

@@ -125,8 +125,8 @@ def _has_witness(hull: Hull, camera: int) -> bool:
     rows, columns = np.nonzero(hull.mask(camera))
     chosen = np.linspace(0, len(rows) - 1, min(_WITNESS_RAYS, len(rows))).astype(np.int64)
     pixels = np.column_stack([columns[chosen] + 0.5, rows[chosen] + 0.5])
-    center = np.linalg.norm(hull.views.img_from_local[camera, 2, 3])  # depth of the local origin
-    depths = np.geomspace(max(center / 8, NEAREST_M), max(center * 8, 1.0), _WITNESS_DEPTHS)
+    center_m = abs(float(hull.views.img_from_local[camera, 2, 3]))  # depth of the local origin
+    depths = np.geomspace(max(center_m / 8, NEAREST_M), max(center_m * 8, 1.0), _WITNESS_DEPTHS)
     points_local = _points(
         hull.views,
         camera,

@@ -31,7 +31,7 @@ from hybridve.hull.capture.recording import (
 from hybridve.hull.capture.rig import load_rig, rig_digest
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
-from hybridve.hull.contact.detect import Body, detect_contacts, make_body
+from hybridve.hull.contact.detect import Body, Contact, detect_contacts, make_body
 from hybridve.hull.contact.scene import Scene
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Views, make_hull, make_views
@@ -166,7 +166,7 @@ def evaluate(
     n_yielded = 0
     for silhouettes in _silhouettes(chain, skip, progress):
         started = time.perf_counter()
-        contacts = ()
+        contacts: tuple[Contact, ...] = ()
         if silhouettes.masks is not None:
             hull = make_hull(chain.views, silhouettes.masks)
             contacts = tuple(detect_contacts(hull, chain.bodies, engine))

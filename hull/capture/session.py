@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator, model_validator
 
 from hybridve.calib.camera import N_PARAMS
 from hybridve.calib.errors import SessionError
@@ -69,11 +69,18 @@ class _SessionTable(_Table):
     min_cameras: Annotated[int, Field(ge=1)] = 1
     rig: str | None = None
     rig_unit: RigUnit | None = None
-    rig_pixel_centre: Literal[0, 0.5] = 0.5
+    rig_pixel_centre: float = 0.5
     target: TargetTable | None = None
     mask_threshold: Annotated[int, Field(ge=0, le=254)] = 127
     segmentation: dict[str, Any] = {}
     camera: Annotated[list[_CameraTable], Field(min_length=1)]
+
+    @field_validator("rig_pixel_centre")
+    @classmethod
+    def _is_a_convention(cls, centre: float) -> float:
+        if centre not in (0.0, 0.5):
+            raise ValueError(f"found {centre}; expected 0.5 (COLMAP) or 0 (OpenCV)")
+        return centre
 
     @model_validator(mode="after")
     def _rig_has_unit(self) -> "_SessionTable":

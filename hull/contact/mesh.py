@@ -53,7 +53,7 @@ def read_mesh(path: Path) -> Mesh:
     import open3d  # late: the import alone takes a second
 
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        loaded = open3d.io.read_triangle_mesh(str(path))
+        loaded = open3d.io.read_triangle_mesh(path)
     vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
     faces = np.array(loaded.triangles, dtype=np.int32).reshape(-1, 3)
     if len(faces) == 0:
