@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridve.hull.query.viewport import (
     MAX_VIEWPORT,
+    hit_positions,
     n_samples,
     sample_positions,
     sample_steps,
@@ -83,3 +84,23 @@ def test_the_chosen_viewport_is_the_smallest_that_keeps_the_accuracy(
 def test_an_accuracy_beyond_every_viewport_is_refused() -> None:
     with pytest.raises(ValueError, match=r"viewport of \d+, more than 65535"):
         viewports_for_accuracy(CORNERS[None], 1e-6)
+
+
+@given(seed=st.integers(0, 2**32 - 1), largest=st.integers(1, 40))
+@settings(deadline=None)  # the first example compiles
+def test_hits_are_positioned_to_the_bits_of_the_specification(seed: int, largest: int) -> None:
+    rng = np.random.default_rng(seed)
+    vertices = rng.normal(size=(9, 3)) * 10.0 ** rng.integers(-3, 4)
+    faces = rng.integers(0, 9, (7, 3)).astype(np.int32)
+    viewports = rng.integers(1, largest + 1, 7).astype(np.int32)
+    triangle = np.repeat(np.arange(7, dtype=np.uint32), [n_samples(int(u)) for u in viewports])
+    sample = np.concatenate([np.arange(n_samples(int(u)), dtype=np.uint32) for u in viewports])
+    order = np.arange(len(triangle))
+    for chosen in (order, order[rng.random(len(order)) < 0.3], rng.permutation(order)):
+        expected = sample_positions(
+            vertices[faces[triangle[chosen]]], viewports[triangle[chosen]], sample[chosen]
+        )
+
+        found = hit_positions(vertices, faces, viewports, triangle[chosen], sample[chosen])
+
+        np.testing.assert_array_equal(found, expected)

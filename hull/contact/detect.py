@@ -15,7 +15,7 @@ from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.engine import Engine, Hits, Triangles
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.viewport import sample_positions, viewports_for_accuracy
+from hybridve.hull.query.viewport import hit_positions, viewports_for_accuracy
 
 #: "colliding": a sample of the surface is inside every silhouette. "free": proved, no point of the
 #: object is in the hull. "": only sampled; a smaller contact may hide between the samples.
@@ -71,7 +71,7 @@ class Contact:
     @property
     def n_triangles(self) -> int:
         """How many triangles have a collision point."""
-        return len(np.unique(self.triangle))
+        return int(np.count_nonzero(np.diff(self.triangle))) + 1 if self.collides else 0
 
 
 def make_body(
@@ -127,9 +127,11 @@ def _contact(hull: Hull, body: Body, hits: Hits, otherwise: Certificate) -> Cont
     if len(hits) == 0:
         return Contact(otherwise, np.zeros((0, 3), np.float32), hits.triangle)
     triangles = body.triangles
-    points_world = sample_positions(
-        triangles.vertices_world[triangles.faces[hits.triangle]],
-        triangles.viewports[hits.triangle],
+    points_world = hit_positions(
+        triangles.vertices_world,
+        triangles.faces,
+        triangles.viewports,
+        hits.triangle,
         hits.sample,
     )
     # An engine in single precision may err at the rim of a silhouette; a witness may not.

@@ -17,6 +17,8 @@ An engine returns numbers; positions come from here alone.
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.jit import compiled
+
 #: More samples an edge than a 16-bit image is wide serve nobody, and their count stays below 2^31.
 MAX_VIEWPORT = 65_535
 
@@ -109,3 +111,69 @@ def viewports_for_accuracy(corners: NDArray[np.float64], accuracy_m: float) -> N
             f"{needed.max():.0f}, more than {MAX_VIEWPORT}"
         )
     return np.asarray(np.maximum(needed, 2), dtype=np.int32)
+
+
+def hit_positions(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    viewports: NDArray[np.int32],
+    triangle: NDArray[np.uint32],
+    sample: NDArray[np.uint32],
+) -> NDArray[np.float64]:
+    """Return where the samples of a mesh lie: `sample_positions`, compiled, to the same bits.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64
+        In any frame.
+    faces : (T, 3) int32
+        Vertex numbers.
+    viewports : (T,) int32
+        The viewport of each triangle.
+    triangle, sample : (P,) uint32
+        Triangles, and numbers of samples in their viewports.
+
+    Returns
+    -------
+    (P, 3) float64
+        Positions in the frame of the vertices.
+    """
+    positions = np.zeros((len(triangle), 3))
+    _fill_positions(vertices, faces, viewports, triangle, sample, positions)
+    return positions
+
+
+@compiled
+def _fill_positions(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    viewports: NDArray[np.int32],
+    triangle: NDArray[np.uint32],
+    sample: NDArray[np.uint32],
+    positions: NDArray[np.float64],
+) -> None:
+    last, row_end, j = -1, 0, 0
+    for hit in range(len(triangle)):
+        t = np.int64(triangle[hit])
+        number = np.int64(sample[hit])
+        u = np.int64(viewports[t])
+        if t != last or number < row_end - (u - j):
+            last, j, row_end = t, 0, u
+        while number >= row_end:  # rows are short, and hits come in order
+            j += 1
+            row_end += u - j
+        i = number - (row_end - (u - j))
+        if u == 1:
+            for axis in range(3):
+                a, b, c = faces[t]
+                positions[hit, axis] = (
+                    vertices[a, axis] + vertices[b, axis] + vertices[c, axis]
+                ) / 3.0
+            continue
+        along, up = i / (u - 1.0), j / (u - 1.0)
+        a, b, c = faces[t]
+        for axis in range(3):
+            start = vertices[a, axis]
+            positions[hit, axis] = (
+                start + (vertices[b, axis] - start) * along + (vertices[c, axis] - start) * up
+            )
