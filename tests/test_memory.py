@@ -1,0 +1,35 @@
+"""Memory does not grow with the length of a recording."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DATA = Path(__file__).parent.parent / "data"
+
+
+def peak_bytes(folder: Path, recordings: Path, frames: str) -> int:
+    """Return the most memory that ``hybridve detect`` held over some frames of horseman."""
+    command = [sys.executable, "-m", "hybridve.cli", "detect", str(folder), "--no-progress"]
+    command += ["--scene", str(DATA / "horseman" / "scene.toml"), "--engine", "native"]
+    command += ["-o", str(folder / "report.h5"), "--overwrite", "--frames", frames]
+    environment = {**os.environ, "HYBRIDVE_DATA": str(recordings.resolve())}
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
+    _, status, usage = os.wait4(process.pid, 0)
+    assert status == 0
+    return usage.ru_maxrss * 1024
+
+
+@pytest.mark.recording
+def test_426_frames_take_no_more_memory_than_50(recordings: Path, tmp_path: Path) -> None:
+    text = (DATA / "horseman" / "session.toml").read_text(encoding="utf-8")
+    rig = 'rig = "{camera}/reference_b_mm.xml"\nrig_unit = "mm"\nrig_pixel_centre = 0\n\n[target]'
+    (tmp_path / "session.toml").write_text(text.replace("[target]", rig), encoding="utf-8")
+
+    few = peak_bytes(tmp_path, recordings, "0:50")
+    all_frames = peak_bytes(tmp_path, recordings, ":")
+
+    # Collision points of these frames would fill 400 MB, decoded frames 1.6 GB.
+    assert all_frames <= 1.2 * few
