@@ -18,7 +18,8 @@ def peak_bytes(folder: Path, recordings: Path, frames: str) -> int:
     environment = {**os.environ, "HYBRIDVE_DATA": str(recordings.resolve())}
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment)
     _, status, usage = os.wait4(process.pid, 0)
-    assert status == 0
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0
     return usage.ru_maxrss * 1024
 
 
