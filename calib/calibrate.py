@@ -21,7 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -101,6 +101,9 @@ class CalibrationSettings:
         Views a lens is fitted to at least.
     max_stills : int
         Stills looked at, evenly spread over what there is.
+    enough_stills : int
+        With fewer stills found by the quick search, the others are searched again with more
+        effort.
     clip_frames : int
         Frames of the extrinsic clip looked at, evenly spread.
     still_px : float
@@ -116,6 +119,7 @@ class CalibrationSettings:
     always_good_px: float = 0.5
     min_views: int = 3
     max_stills: int = 120
+    enough_stills: int = 20
     clip_frames: int = 40
     still_px: float = 1.0
     loss_px: float = 1.0
@@ -126,6 +130,9 @@ _DEFAULTS = CalibrationSettings()
 
 #: Frames in which the stillness of an averaged clip is measured.
 _SPREAD_FRAMES = 9
+
+#: Frames whose means over 15x15 pixels differ by less show the same.
+_STILL_GREY = 8.0
 
 #: Bytes of grey frames of one clip held at once; larger images are averaged over fewer frames.
 _CLIP_BYTES = 200_000_000
@@ -369,16 +376,27 @@ def _observe_stills(
                 missed[name] = "no board found"
             else:
                 corners[name] = found
-            report(f"stills of {camera.name}", len(corners) + len(missed), total)
+                missed.pop(name, None)
 
-    for index, image in enumerate(source.frames(step=step)):
-        name = f"frame {index * step}" if source.is_video else source.paths[index * step].name
-        sizes[name] = (image.shape[1], image.shape[0])
-        waiting.append((name, pool.submit(detect_corners, image, board, False)))
-        collect(in_flight)  # so that memory does not grow with the source
-    collect(0)
+    def search(effort: Literal["quick", "usual"], what: str) -> None:
+        done = 0
+        for done, image in enumerate(source.frames(step=step), start=1):
+            index = (done - 1) * step
+            name = f"frame {index}" if source.is_video else source.paths[index].name
+            sizes[name] = (image.shape[1], image.shape[0])
+            if name not in corners:
+                waiting.append((name, pool.submit(detect_corners, image, board, effort)))
+            collect(in_flight)  # so that memory does not grow with the source
+            report(what, min(done, total), total)
+        collect(0)
+        report(what, total, total)  # a video may end before its header says
+
+    search("quick", f"stills of {camera.name}")
     if not sizes:
         raise CalibrationError(f"camera {camera.name!r}: {source.label} holds no picture")
+    if missed and len(corners) < settings.enough_stills:
+        search("usual", f"stills of {camera.name}, again")
+    corners = {name: corners[name] for name in sizes if name in corners}  # in their own order
     logger.info("camera %s: board found in %d of %d stills", camera.name, len(corners), len(sizes))
     counts = Counter(sizes.values())
     size_px = max(counts, key=lambda size: (counts[size], size))
@@ -439,7 +457,7 @@ def _observe_still_clip(
     size_px = (frames[0].shape[1], frames[0].shape[0])
     picture = _steady_mean(frames)
     by_hand = _corners_by_hand(board, camera)
-    detection = detect_corners(picture, board, thorough=False)
+    detection = detect_corners(picture, board, "quick")
     if detection.corners is None:
         if _moves(board, frames, settings):
             return None
@@ -512,7 +530,12 @@ def _moves(
 ) -> bool:
     """Tell whether the board is found in different places of a clip's first, middle, last frame."""
     chosen = sorted({0, len(frames) // 2, len(frames) - 1})
-    found = [detect_corners(frames[index], board, thorough=False).corners for index in chosen]
+    change = max(
+        float(cv2.blur(cv2.absdiff(frames[0], frames[index]), (15, 15)).max()) for index in chosen
+    )
+    if change < _STILL_GREY:
+        return False  # spares the search in three pictures that are the same but for noise
+    found = [detect_corners(frames[index], board, "usual").corners for index in chosen]
     seen = [corners for corners in found if corners is not None]
     return any(np.abs(a - b).max() > settings.still_px for a, b in combinations(seen, 2))
 
@@ -557,7 +580,7 @@ def _observe_moving_clip(
     for index, image in enumerate(source.frames(step=step)):
         size_px = (image.shape[1], image.shape[0])
         count += 1
-        found = detect_corners(image, board, thorough=False).corners
+        found = detect_corners(image, board, "usual").corners
         if found is not None:
             corners[index * step] = found
     if not corners:

@@ -374,14 +374,6 @@ def adjust(
         for element in track:
             model.add_observation(corner + 1, element)
         problem.add_constant_point(corner + 1)
-    if len(used) > 1:
-        seen_together = {view.camera for view in views}
-        for index in used[1:]:
-            if index not in seen_together:
-                problem.set_constant_sensor_from_rig_pose(
-                    pycolmap.sensor_t(pycolmap.SensorType.CAMERA, index + 1)
-                )
-
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(
         _options(loss_px, fix_principal_point), problem, model
     )

@@ -237,7 +237,7 @@ def test_a_picture_without_a_board_gives_none_and_says_what_was_tried(
 ) -> None:
     image = np.random.default_rng(2).integers(0, 255, shape, dtype=np.uint8)
 
-    detection = detect_corners(image, BOARD, thorough=False)
+    detection = detect_corners(image, BOARD, "usual")
 
     assert detection.corners is None
     assert detection.how.startswith("tried classic")
