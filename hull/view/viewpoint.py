@@ -35,6 +35,9 @@ _STRAY = 0.01
 #: Points that stand for the objects, and for what collides, when directions are compared.
 _N_SAMPLES, _N_HITS = 3000, 600
 
+#: Points of an object that the framing minds, about.
+_MOST_FOCUS = 2000
+
 #: The raster in which directions are compared.
 RASTER_PX = (64, 40)
 
@@ -99,9 +102,19 @@ def focus_points(hull: Hull, cells: Cells, objects: list[DrawnObject]) -> NDArra
     for item in objects:
         vertices = item.vertices_world[np.unique(item.faces)]
         away = np.linalg.norm(vertices - near_middle, axis=1)
-        points.append(vertices[away <= near_m])
-        points.append(np.asarray(item.hit_points_world, np.float64).reshape(-1, 3))
+        points.append(_outline(vertices[away <= near_m]))
+        points.append(_outline(np.asarray(item.hit_points_world, np.float64).reshape(-1, 3)))
     return np.concatenate(points)
+
+
+def _outline(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return some of the points (N, 3), the outermost ones among them."""
+    if len(points) <= _MOST_FOCUS:
+        return points
+    steps = np.array([-1.0, 0.0, 1.0])
+    directions = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    outermost = [int((points @ direction).argmax()) for direction in directions]
+    return points[np.union1d(outermost, np.arange(0, len(points), len(points) // _MOST_FOCUS))]
 
 
 def fitting_eye(
