@@ -105,11 +105,11 @@ def _print(numbers: dict[str, Any]) -> None:
     if "rms_px" in numbers:
         click.echo(f"  joint adjustment: {numbers['rms_px']:.3f} px rms over all views")
     labelling = numbers.get("labelling", {})
-    if labelling.get("decided_by"):
+    if "weakest_sigma" in labelling:
         click.echo(
             "  the board looks the same turned; which way round each camera saw it was decided by "
             f"{labelling['decided_by']}, by {labelling['weakest_sigma']:.1f} standard deviations "
-            f"or more{' (WEAK: check that Z is up)' if labelling.get('is_weak') else ''}"
+            f"or more{' (weak: compare a distance you know)' if labelling.get('is_weak') else ''}"
         )
     if "check" in numbers:
         click.echo(f"  {numbers['check']['message']}")
