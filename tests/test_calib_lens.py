@@ -1,0 +1,186 @@
+"""Cameras, lenses and poses: what goes out comes back, and what cannot be is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.boards import HEIGHT_PX, LENSES, WIDTH_PX, look_at, make_camera
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.lens import cam_from_img, img_from_cam, project_points, undistortion
+from hybridve.calib.pose import (
+    angle_between,
+    compose,
+    invert,
+    rotation_about_axes,
+    transform,
+)
+from hybridve.calib.rig import Rig
+
+#: A pixel led to a ray and back, in pixels; COLMAP iterates to 1e-10 of a ray.
+ROUND_TRIP_PX = 1e-5
+
+#: float32 maps of 700 pixels round to this.
+MAP_PX = 1e-3
+
+POSE = look_at((1.2, -0.8, 0.9), (0.0, 0.0, 0.1), 5.0)
+
+angles = st.floats(-180.0, 180.0)
+poses = st.tuples(
+    st.tuples(angles, angles, angles).map(rotation_about_axes),
+    st.lists(st.floats(-10, 10), min_size=3, max_size=3),
+).map(lambda parts: np.column_stack(parts))
+
+
+@given(a_from_b=poses, b_from_c=poses)
+def test_inner_names_meet(a_from_b: NDArray[np.float64], b_from_c: NDArray[np.float64]) -> None:
+    points_c = np.array([[0.3, -0.2, 1.0], [5.0, 0.0, -2.0]])
+
+    at_once = transform(compose(a_from_b, b_from_c), points_c)
+    one_by_one = transform(a_from_b, transform(b_from_c, points_c))
+
+    np.testing.assert_allclose(at_once, one_by_one, atol=1e-9)
+    np.testing.assert_allclose(
+        transform(invert(b_from_c), transform(b_from_c, points_c)), points_c, atol=1e-9
+    )
+
+
+@given(pose=poses, turn_deg=st.floats(0.0, 180.0))
+def test_the_angle_between_poses_is_that_of_the_turn(
+    pose: NDArray[np.float64], turn_deg: float
+) -> None:
+    turn = np.column_stack([rotation_about_axes((0.0, 0.0, turn_deg)), np.zeros(3)])
+
+    assert angle_between(pose, compose(pose, turn)) == pytest.approx(np.deg2rad(turn_deg), abs=1e-7)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_pixel_leads_to_a_ray_that_leads_back(model: str) -> None:
+    camera = make_camera("cam", model, POSE)
+    x, y = np.meshgrid(np.linspace(40, WIDTH_PX - 40, 9), np.linspace(40, HEIGHT_PX - 40, 7))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+
+    rays = cam_from_img(camera, pixels)
+
+    # Three times as far along the ray is the same pixel.
+    again = img_from_cam(camera, 3.0 * np.column_stack([rays, np.ones(len(rays))]))
+    assert np.abs(again - pixels).max() < ROUND_TRIP_PX
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_axis_is_imaged_at_the_principal_point(model: str) -> None:
+    camera = make_camera("cam", model, POSE)
+    on_axis = camera.center_world + 2.0 * camera.cam_from_world[2, :3]
+
+    pixels, depth_m = project_points(camera, on_axis[None])
+
+    np.testing.assert_allclose(pixels[0], camera.pinhole[:2, 2], atol=1e-9)
+    np.testing.assert_allclose(depth_m, [2.0], atol=1e-12)
+
+
+def test_points_behind_the_camera_have_no_pixel() -> None:
+    camera = make_camera("cam", "OPENCV", POSE)
+    behind = camera.center_world - camera.cam_from_world[2, :3]
+
+    pixels, depth_m = project_points(camera, np.stack([behind, np.zeros(3)]))
+
+    assert np.isnan(pixels[0]).all()
+    assert depth_m[0] == pytest.approx(-1.0)
+    assert np.isfinite(pixels[1]).all()
+
+
+def test_no_points_give_no_pixels() -> None:
+    pixels, depth_m = project_points(make_camera("cam", "OPENCV", POSE), np.zeros((0, 3)))
+
+    assert pixels.shape == (0, 2)
+    assert depth_m.shape == (0,)
+
+
+def test_skew_shears_the_image() -> None:
+    camera = make_camera("cam", "PINHOLE", POSE)
+    skewed = replace(camera, skew_px=30.0)
+    ray = np.array([[0.1, 0.2, 1.0]])
+
+    difference = img_from_cam(skewed, ray) - img_from_cam(camera, ray)
+
+    np.testing.assert_allclose(difference, [[30.0 * 0.2, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(
+        cam_from_img(skewed, img_from_cam(skewed, ray)), ray[:, :2], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "DIVISION", "SIMPLE_RADIAL"])
+def test_the_undistorted_image_holds_the_recorded_one_and_is_a_pinhole(model: str) -> None:
+    camera = make_camera("cam", model, POSE)
+
+    pinhole = undistortion(camera)
+
+    assert pinhole.map_x is not None
+    assert pinhole.map_y is not None
+    # Where a recorded pixel lands in the pinhole image, the map leads back to it.
+    pixels = np.array([[60.0, 50.0], [320.0, 240.0], [600.0, 430.0]])
+    rays = cam_from_img(camera, pixels)
+    landed = np.column_stack([rays, np.ones(3)]) @ pinhole.img_from_cam.T
+    columns, rows = np.floor(landed[:, :2]).astype(int).T
+    assert ((columns >= 0) & (columns < pinhole.width_px)).all()
+    assert ((rows >= 0) & (rows < pinhole.height_px)).all()
+    centers = np.column_stack([columns + 0.5, rows + 0.5, np.ones(3)])
+    expected = img_from_cam(camera, np.linalg.solve(pinhole.img_from_cam, centers.T).T)
+    mapped = np.column_stack([pinhole.map_x[rows, columns], pinhole.map_y[rows, columns]])
+    np.testing.assert_allclose(mapped + 0.5, expected, atol=MAP_PX)
+
+
+def test_a_pinhole_needs_no_undistortion() -> None:
+    camera = make_camera("cam", "PINHOLE", POSE)
+
+    same = undistortion(camera)
+
+    assert same.map_x is None
+    assert (same.width_px, same.height_px) == (WIDTH_PX, HEIGHT_PX)
+    np.testing.assert_array_equal(same.img_from_cam, camera.pinhole)
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"model": "GOPRO"}, "unknown camera model 'GOPRO'; one of SIMPLE_PINHOLE"),
+        ({"width_px": 0}, "image size 0x480 is not positive"),
+        ({"params": np.ones(3)}, r"params has shape \(3,\), expected \(4,\)"),
+        ({"params": np.array([1.0, np.nan, 1, 1])}, "of finite numbers"),
+        ({"cam_from_world": np.eye(4)}, r"cam_from_world has shape \(4, 4\)"),
+        ({"cam_from_world": 2.0 * np.eye(3, 4)}, "not a rotation and a translation"),
+        ({"cam_from_world": np.diag([1.0, 1, -1])[:, [0, 1, 2, 2]]}, "not a rotation"),
+        ({"model": "OPENCV", "params": np.ones(8), "skew_px": 1.0}, "takes no skew"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_by_name(changes: dict[str, object], found: str) -> None:
+    camera = make_camera("cam7", "PINHOLE", POSE)
+
+    with pytest.raises(CalibrationError, match=rf"'cam7'.*{found}"):
+        replace(camera, **changes)
+
+
+def test_a_cameras_arrays_are_its_own_and_cannot_be_written() -> None:
+    params = np.array([500.0, 500.0, 320.0, 240.0])
+    camera = Camera("cam", "PINHOLE", 640, 480, params, np.eye(3, 4))
+
+    params[0] = 1.0
+
+    assert camera.params[0] == 500.0
+    with pytest.raises(ValueError, match="read-only"):
+        camera.params[0] = 1.0
+
+
+def test_a_rig_has_cameras_with_names_of_their_own() -> None:
+    camera = make_camera("cam", "PINHOLE", POSE)
+
+    with pytest.raises(CalibrationError, match="no camera"):
+        Rig(())
+    with pytest.raises(CalibrationError, match="'cam' stands in the rig 2 times"):
+        Rig((camera, camera))
+    with pytest.raises(CalibrationError, match="no camera 'other'; it has cam"):
+        Rig((camera,))["other"]
