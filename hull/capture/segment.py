@@ -1,26 +1,36 @@
 """From a frame and the empty scene to the silhouette of what is new.
 
-A pixel is an object pixel when it differs from the empty scene by more than noise explains, and
-not in the way of a cast shadow:
+Each pixel is asked which explains it best: the empty scene with its noise, the empty scene in a
+shadow, or an object, which can have any colour. The answer is its *evidence*: the logarithm of how
+much likelier an object is than the better of the two others.
 
 * *Noise* has three parts: what the pixel did over time in the empty scene, a floor in grey levels
-  for rounding and compression, and a share of the brightness. A picture may also be shifted by a
-  pixel (compression, a camera that was touched), so that a value is compared with the range of its
+  for compression, and a share of the brightness. A picture may also be off by a pixel
+  (compression, a camera that was touched), so that a value is compared with the range of its
   neighbours in the empty scene and only what lies outside counts.
-* *A shadow* darkens all channels by one factor: the pixel is the empty scene times a, with a
-  between two limits. (A little light thrown back by an object is the same with a above 1.)
+* *A shadow* darkens all channels by one factor, between two limits, and the pixels around it by
+  much the same factor, so that the texture of the empty scene is still seen in it. A grey car on a
+  grey road has the colour of a shadow, but not the texture. (A little light thrown back by an
+  object is the same with a factor above 1.)
+* *Objects* have a few colours each: those of the pixels that are objects beyond doubt are likelier
+  than others elsewhere in the same frame, too.
 * *The camera's gain* may have changed: the median of the ratio to the empty scene tells by how
   much, since objects fill less than half of the picture.
 
-Afterwards a median takes out lone pixels, a closing joins what a pixel parts, specks go and holes
-that are too small to look through are filled.
+The evidence, limited in both directions, is summed over 3 x 3 pixels; objects are where the sum is
+positive. Then gaps of a pixel are closed, specks dropped, and holes filled that are too small to
+tell from a patch of an object that looks like what is behind it.
 
 References
 ----------
 Horprasert, Harwood and Davis, A statistical approach for real-time robust background subtraction
 and shadow detection, ICCV Frame-Rate Workshop, 1999: brightness and chromaticity distortion.
+Sanin, Sanderson and Lovell, Shadow detection: a survey and comparative evaluation of recent
+methods, Pattern Recognition 45(4), 2012: texture tells grey objects from shadows.
 """
 
+import math
+import threading
 from dataclasses import dataclass
 
 import cv2
@@ -32,11 +42,42 @@ from hybridve.calib.image_io import Image
 from hybridve.hull.capture.background import Background
 from hybridve.hull.jit import compiled
 
-#: Every how many pixels the camera's gain looks at the picture.
-_GAIN_STEP = 8
+#: About how many pixels the camera's gain looks at.
+_GAIN_PIXELS = 2000
 
 #: Pixels of the empty scene darker than this (grey levels) say nothing of the gain.
 _GAIN_DARKEST = 16.0
+
+#: A pixel that differs by more than this factor is an object or a shadow, not another gain.
+_GAIN_LIMIT = 1.25
+
+#: Within this share of the threshold in every channel a pixel is background outright: nothing
+#: else is asked of it. It saves nine tenths of the work.
+_OUTRIGHT = 0.75
+
+#: The factor of a shadow is compared with its mean over this many pixels each way.
+_SHADE_REACH_PX = 3
+
+#: By how much the factor of a shadow varies over these pixels, where it is soft: 1 sigma.
+_SHADE_VARIES = 0.04
+
+#: Evidence from which a pixel is an object beyond doubt, and tells what colours objects have.
+_BEYOND_DOUBT = 12.0
+
+#: Colours are counted in boxes of 16 x 16 x 16 grey levels.
+_COLOUR_SHIFT = 4
+_N_COLOURS = (256 >> _COLOUR_SHIFT) ** 3
+
+#: As many pixels beyond doubt as this give the colours that they show half of their full weight,
+#: and full weight means that half of the objects' pixels have colours seen elsewhere.
+_COLOUR_PIXELS = 500
+_COLOUR_WEIGHT = 0.5
+
+#: Evidence is limited to this in both directions, lest one pixel outweighs its neighbours.
+_EVIDENCE_LIMIT = 6.0
+
+#: Evidence as bytes: this many steps a unit, about 128.
+_EVIDENCE_STEPS = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,27 +87,30 @@ class SegmentSettings:
     Attributes
     ----------
     threshold : float
-        By how many standard deviations of the noise an object pixel differs.
+        By how many standard deviations of the noise an object pixel differs; somewhat fewer where
+        the scene is noisy by itself, and for colours that objects have elsewhere in the frame.
     noise_floor : float
-        Least standard deviation of a pixel, grey levels.
+        Least standard deviation of a pixel, grey levels. Lower it for cameras that do not
+        compress.
     noise_share : float
         Standard deviation as a share of the brightness.
     shadow_darkest, shadow_brightest : float
         Between which factors of the empty scene a pixel may be a shadow, or light thrown back.
+        Both 1: there are no shadows.
     shadow_threshold : float
-        How many standard deviations a shadow may be off the empty scene's colour.
+        How many standard deviations a shadow may be off the colour and the texture of the scene.
     speck_px : int
         Objects of fewer pixels are dropped.
     hole_px : int
         Holes of fewer pixels are filled.
     """
 
-    threshold: float = 8.0
-    noise_floor: float = 2.0
+    threshold: float = 4.0
+    noise_floor: float = 5.0
     noise_share: float = 0.015
-    shadow_darkest: float = 0.55
+    shadow_darkest: float = 0.5
     shadow_brightest: float = 1.15
-    shadow_threshold: float = 5.0
+    shadow_threshold: float = 3.2
     speck_px: int = 60
     hole_px: int = 150
 
@@ -87,6 +131,9 @@ class SegmentSettings:
 class Segmenter:
     """Cuts objects out of the frames of one camera.
 
+    It keeps what it works on between frames, so that threads that share one take turns; give each
+    thread its own.
+
     Parameters
     ----------
     background : Background
@@ -97,26 +144,44 @@ class Segmenter:
 
     def __init__(self, background: Background, settings: SegmentSettings) -> None:
         self._settings = settings
-        mean = background.mean
-        self._mean = np.ascontiguousarray(mean)
+        mean = np.ascontiguousarray(background.mean, np.float32)
+        self._mean = mean
         variance = (
             settings.noise_floor**2
-            + background.noise**2
+            + np.square(background.noise)
             + np.square(np.float32(settings.noise_share) * mean)
         )
         self._weight = np.ascontiguousarray(1.0 / variance, np.float32)  # (H, W, 3)
+        self._norm2 = (mean * mean * self._weight).sum(axis=2)  # (H, W)
+        # The noisier a pixel, the more of the colours that an object could have it covers, and the
+        # less it takes to prefer the object; but never less than half the threshold.
+        covers = 0.5 * np.log(variance / settings.noise_floor**2).sum(axis=2)
+        self._bar, self._shadow_bar = (
+            np.maximum(sigmas**2 / 2 - covers, sigmas**2 / 8).astype(np.float32)
+            for sigmas in (settings.threshold, settings.shadow_threshold)
+        )
         around = np.ones((3, 3), np.uint8)
-        self._low = cv2.erode(mean, around)
-        self._high = cv2.dilate(mean, around)
-        # Where each channel alone stays within threshold / sqrt(3), the pixel is background. Half a
-        # grey level less on either side allows for a picture that is rounded after its gain.
-        reach = settings.threshold / np.sqrt(3.0 * self._weight)
-        self._surely_above = np.clip(np.ceil(self._low - reach + 0.5), 0, 255).astype(np.uint8)
-        self._surely_below = np.clip(np.floor(self._high + reach - 0.5), 0, 255).astype(np.uint8)
-        self._ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-        sampled = mean[::_GAIN_STEP, ::_GAIN_STEP].ravel()
+        self._low = np.asarray(cv2.erode(mean, around), np.float32)
+        self._high = np.asarray(cv2.dilate(mean, around), np.float32)
+        # Half a grey level less on either side allows for a picture that is rounded after its gain.
+        reach = _OUTRIGHT * np.sqrt(2 * self._bar[..., None] * variance / 3)
+        self._least = np.clip(np.ceil(self._low - reach + 0.5), 0, 255).astype(np.uint8)
+        self._most = np.clip(np.floor(self._high + reach - 0.5), 0, 255).astype(np.uint8)
+        self._cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        side = 2 * _SHADE_REACH_PX + 1
+        self._shade_window = np.ones((side, side), np.uint8)
+        self._gain_step = max(round(math.sqrt(self._bar.size / _GAIN_PIXELS)), 1)
+        sampled = mean[:: self._gain_step, :: self._gain_step].ravel()
         self._tells_gain = np.flatnonzero(sampled > _GAIN_DARKEST)
         self._sampled_mean = sampled[self._tells_gain]
+
+        self._lock = threading.Lock()
+        self._as_when_empty = np.zeros(mean.shape, np.uint8)
+        size = mean.shape[:2]
+        self._misfit2, self._shadow_misfit2, self._shade, self._trust = (
+            np.zeros(size, np.float32) for _ in range(4)
+        )
+        self._places = np.zeros((size[0] * size[1], 2), np.int32)
 
     def segment(self, image: Image) -> NDArray[np.uint8]:
         """Return the (H, W) silhouette of a (H, W, 3) BGR frame, 1 on object pixels.
@@ -131,35 +196,69 @@ class Segmenter:
                 f"the picture is {image.shape[1]}x{image.shape[0]}, its background is "
                 f"{self._mean.shape[1]}x{self._mean.shape[0]}"
             )
+        with self._lock:
+            evidence = self._evidence(image)
+        cv2.blur(evidence, (3, 3), dst=evidence)
+        mask = np.greater(evidence[1:-1, 1:-1], _as_byte(0.0)).view(np.uint8)
+        closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, self._cross), np.uint8)
+        # OpenCV closes towards the border, as if objects went on there.
+        for border in np.s_[[0, -1], :], np.s_[:, [0, -1]]:
+            closed[border] = mask[border]
+        return clean(closed, self._settings.speck_px, self._settings.hole_px)
+
+    def _evidence(self, image: Image) -> NDArray[np.uint8]:
+        """Return how much more each pixel looks like an object: 128 + 20 per unit, (H + 2, W + 2).
+
+        There is one pixel more on each side, of which nothing is known.
+        """
         settings = self._settings
         gain = self._gain(image)
-        as_when_empty = np.clip(np.round(np.arange(256) / gain), 0, 255).astype(np.uint8)
-        mask = cv2.inRange(
-            cv2.LUT(image, as_when_empty), self._surely_above, self._surely_below
-        )  # 255 where the pixel is background beyond doubt
-        _classify(
+        levels = np.clip(np.round(np.arange(256) / gain), 0, 255).astype(np.uint8)
+        cv2.LUT(image, levels, dst=self._as_when_empty)
+        outright = cv2.inRange(self._as_when_empty, self._least, self._most)
+        open_questions = np.asarray(cv2.bitwise_not(outright), np.uint8)
+        _compare(
             image,
+            np.asarray(cv2.dilate(open_questions, self._shade_window), np.uint8),
             self._mean,
             self._low,
             self._high,
             self._weight,
+            self._norm2,
             np.float32(1.0 / gain),
-            np.float32(settings.threshold**2),
-            np.float32(settings.shadow_threshold**2),
             np.float32(settings.shadow_darkest),
             np.float32(settings.shadow_brightest),
-            mask,
+            np.float32(settings.shadow_threshold**2),
+            self._misfit2,
+            self._shadow_misfit2,
+            self._shade,
+            self._trust,
         )
-        cv2.medianBlur(mask, 3, dst=mask)
-        cv2.morphologyEx(mask, cv2.MORPH_CLOSE, self._ellipse, dst=mask)
-        return clean(mask, settings.speck_px, settings.hole_px)
+        height, width = outright.shape
+        result = np.full((height + 2, width + 2), _as_byte(0.0), np.uint8)
+        inner = result[1:-1, 1:-1]
+        inner[:] = _as_byte(-_EVIDENCE_LIMIT)
+        _weigh(
+            image,
+            open_questions,
+            self._norm2,
+            self._bar,
+            self._shadow_bar,
+            self._shade,
+            self._trust,
+            self._shadow_misfit2,
+            self._misfit2,
+            self._places,
+            inner,
+        )
+        return result
 
     def _gain(self, image: Image) -> float:
         """Return how much brighter the camera sees the scene than when it was empty."""
-        if len(self._sampled_mean) == 0:
-            return 1.0
-        values = image[::_GAIN_STEP, ::_GAIN_STEP].ravel()[self._tells_gain]
-        return max(float(np.median(values / self._sampled_mean)), 1e-3)
+        values = image[:: self._gain_step, :: self._gain_step].ravel()[self._tells_gain]
+        ratios = values / self._sampled_mean
+        ratios = ratios[(ratios > 1 / _GAIN_LIMIT) & (ratios < _GAIN_LIMIT)]
+        return float(np.median(ratios)) if len(ratios) else 1.0
 
 
 def clean(mask: NDArray[np.uint8], speck_px: int, hole_px: int) -> NDArray[np.uint8]:
@@ -173,29 +272,17 @@ def clean(mask: NDArray[np.uint8], speck_px: int, hole_px: int) -> NDArray[np.ui
     mask : (H, W) uint8
         1 on object pixels.
     """
-    result = _drop_small(mask, speck_px, connectivity=8)
-    columns, rows = np.flatnonzero(result.any(axis=0)), np.flatnonzero(result.any(axis=1))
-    if len(columns) == 0:
-        return result
-    # Holes lie within the bounding rectangle; a pixel more, so that what is outside hangs together.
-    top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-    framed = np.ones((bottom - top + 2, right - left + 2), np.uint8)
-    np.subtract(1, result[top:bottom, left:right], out=framed[1:-1, 1:-1])
-    kept = _drop_small(framed, hole_px, connectivity=4)
-    np.subtract(1, kept[1:-1, 1:-1], out=result[top:bottom, left:right])
-    return result
-
-
-def _drop_small(mask: NDArray[np.uint8], least_px: int, *, connectivity: int) -> NDArray[np.uint8]:
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=connectivity)
     result = mask.copy()
-    for label in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] < least_px):
-        if label == 0:
-            continue
-        left, top, width, height = stats[label, :4]
-        box = np.s_[top : top + height, left : left + width]
-        result[box][labels[box] == label] = 0
+    objects = _bounded(result)
+    _flip_small(objects, 1, speck_px)
+    _flip_small(_bounded(objects), 0, hole_px)
     return result
+
+
+def _bounded(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the part of a mask within the bounding rectangle of its objects, not a copy."""
+    left, top, width, height = cv2.boundingRect(mask)
+    return mask[top : top + height, left : left + width]
 
 
 def threshold_mask(image: Image, threshold: int = 127) -> NDArray[np.uint8]:
@@ -204,52 +291,226 @@ def threshold_mask(image: Image, threshold: int = 127) -> NDArray[np.uint8]:
     return (grey > threshold).astype(np.uint8)
 
 
+def _as_byte(evidence: float) -> int:
+    return 128 + round(_EVIDENCE_STEPS * evidence)
+
+
 @compiled
-def _classify(
+def _compare(
     image: NDArray[np.uint8],
+    looked_at: NDArray[np.uint8],
     mean: NDArray[np.float32],
     low: NDArray[np.float32],
     high: NDArray[np.float32],
     weight: NDArray[np.float32],
+    norm2: NDArray[np.float32],
     inverse_gain: np.float32,
-    threshold2: np.float32,
+    darkest: np.float32,
+    brightest: np.float32,
     shadow_threshold2: np.float32,
-    shadow_darkest: np.float32,
-    shadow_brightest: np.float32,
-    mask: NDArray[np.uint8],
+    misfit2: NDArray[np.float32],
+    shadow_misfit2: NDArray[np.float32],
+    shade: NDArray[np.float32],
+    trust: NDArray[np.float32],
 ) -> None:
-    """Turn a mask of what is surely background (255) into one of objects (1).
+    """Compare pixels that are not 0 in `looked_at` with the empty scene, by themselves.
 
-    The exact test is made for the pixels that are 0 in `mask`; the others become 0.
+    Writes to (H, W) arrays: the squared distances from the empty scene and from its darker colours
+    in standard deviations, the factor by which a pixel is darker, and how much that can be trusted
+    (the inverse of its variance; 0 where the colour does not fit a shadow). Other pixels are left
+    as they were.
     """
     zero = np.float32(0.0)
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
-            if mask[row, column] != 0:
-                mask[row, column] = 0
+            if looked_at[row, column] == 0:
                 continue
             outside2 = zero
             along = zero
-            norm2 = zero
             for channel in range(3):
                 value = np.float32(image[row, column, channel]) * inverse_gain
                 w = weight[row, column, channel]
-                m = mean[row, column, channel]
                 off = min(value - low[row, column, channel], zero) + max(
                     value - high[row, column, channel], zero
                 )
                 outside2 += off * off * w
-                along += value * m * w
-                norm2 += m * m * w
-            if outside2 <= threshold2:
+                along += value * mean[row, column, channel] * w
+            factor = along / max(norm2[row, column], np.float32(1e-6))
+            factor = min(max(factor, darkest), brightest)
+            across2 = zero
+            for channel in range(3):
+                value = np.float32(image[row, column, channel]) * inverse_gain
+                off = value - factor * mean[row, column, channel]
+                across2 += off * off * weight[row, column, channel]
+            misfit2[row, column] = outside2
+            shadow_misfit2[row, column] = across2
+            shade[row, column] = factor
+            trust[row, column] = norm2[row, column] if across2 < shadow_threshold2 else zero
+
+
+@compiled
+def _weigh(
+    image: NDArray[np.uint8],
+    open_questions: NDArray[np.uint8],
+    norm2: NDArray[np.float32],
+    bar: NDArray[np.float32],
+    shadow_bar: NDArray[np.float32],
+    shade: NDArray[np.float32],
+    trust: NDArray[np.float32],
+    shadow_misfit2: NDArray[np.float32],
+    evidence: NDArray[np.float32],
+    places: NDArray[np.int32],
+    result: NDArray[np.uint8],
+) -> None:
+    """Write the evidence of pixels that are not 0 in `open_questions` to `result`, as bytes.
+
+    `evidence` is the output `misfit2` of `_compare` and is overwritten; `places` is (H W, 2) to
+    work on.
+    """
+    height, width = open_questions.shape
+    half = np.float32(0.5)
+    varies2 = np.float32(_SHADE_VARIES * _SHADE_VARIES)
+    trusts = np.zeros(width, np.float32)  # sums over the rows of the window
+    shades = np.zeros(width, np.float32)
+    counts = np.zeros(_N_COLOURS, np.int64)
+    n_counted = 0
+    n_places = 0
+    for row in range(height):
+        for column in range(width):
+            if open_questions[row, column] != 0:
+                places[n_places, 0] = row
+                places[n_places, 1] = column
+                n_places += 1
+
+    stop = 0
+    while stop < n_places:
+        # Pixels of one row whose windows touch share their sums over the rows of the window.
+        start = stop
+        row = places[start, 0]
+        stop += 1
+        while (
+            stop < n_places
+            and places[stop, 0] == row
+            and places[stop, 1] - places[stop - 1, 1] <= 2 * _SHADE_REACH_PX
+        ):
+            stop += 1
+        left = max(places[start, 1] - _SHADE_REACH_PX, 0)
+        right = min(places[stop - 1, 1] + _SHADE_REACH_PX + 1, width)
+        trusts[left:right] = 0
+        shades[left:right] = 0
+        for other in range(max(row - _SHADE_REACH_PX, 0), min(row + _SHADE_REACH_PX + 1, height)):
+            for column in range(left, right):
+                trusts[column] += trust[other, column]
+                shades[column] += trust[other, column] * shade[other, column]
+        for place in range(start, stop):
+            column = places[place, 1]
+            trust_around = np.float32(0.0)
+            shade_around = np.float32(0.0)
+            for other in range(
+                max(column - _SHADE_REACH_PX, 0), min(column + _SHADE_REACH_PX + 1, width)
+            ):
+                trust_around += trusts[other]
+                shade_around += shades[other]
+            texture2 = np.float32(0.0)
+            if trust_around > 0:
+                off = shade[row, column] - shade_around / trust_around
+                n2 = norm2[row, column]
+                texture2 = off * off * n2 / (np.float32(1.0) + varies2 * n2)
+            found = min(
+                half * evidence[row, column] - bar[row, column],
+                half * (shadow_misfit2[row, column] + texture2) - shadow_bar[row, column],
+            )
+            evidence[row, column] = found
+            if found > _BEYOND_DOUBT:
+                counts[_colour(image, row, column)] += 1
+                n_counted += 1
+
+    weight = _COLOUR_WEIGHT * n_counted / (n_counted + _COLOUR_PIXELS)
+    likelier = np.full(_N_COLOURS, np.float32(np.log(1.0 - weight)), np.float32)
+    for colour in range(_N_COLOURS):
+        if counts[colour] > 0:
+            share = counts[colour] * _N_COLOURS / n_counted
+            likelier[colour] = np.log(weight * share + 1.0 - weight)
+    limit = np.float32(_EVIDENCE_LIMIT)
+    for place in range(n_places):
+        row = places[place, 0]
+        column = places[place, 1]
+        found = evidence[row, column] + likelier[_colour(image, row, column)]
+        found = min(max(found, -limit), limit)
+        result[row, column] = np.uint8(np.float32(128.5) + np.float32(_EVIDENCE_STEPS) * found)
+
+
+@compiled
+def _colour(image: NDArray[np.uint8], row: int, column: int) -> int:
+    """Return which box of colours a pixel is in."""
+    bits = 8 - _COLOUR_SHIFT
+    blue = image[row, column, 0] >> _COLOUR_SHIFT
+    green = image[row, column, 1] >> _COLOUR_SHIFT
+    red = image[row, column, 2] >> _COLOUR_SHIFT
+    return int((((blue << bits) + green) << bits) + red)
+
+
+@compiled
+def _flip_small(mask: NDArray[np.uint8], value: int, least_px: int) -> None:
+    """Turn the pieces of `value` (0 or 1) with fewer than `least_px` pixels into the other.
+
+    Pieces of 1 hang together across corners, those of 0 do not; pieces of 0 at the border of the
+    mask stay. Runs of equal pixels along the rows are joined, which takes little time where
+    silhouettes are few and smooth.
+    """
+    height, width = mask.shape
+    n_runs = 0
+    for row in range(height):
+        before = 1 - value
+        for column in range(width):
+            if mask[row, column] == value != before:
+                n_runs += 1
+            before = mask[row, column]
+    runs = np.zeros((n_runs, 3), np.int32)  # row, first column, column after the last
+    parent = np.arange(n_runs)
+    area = np.zeros(n_runs, np.int64)
+    reach = value  # how far beyond its ends a run touches those in the row above
+    run = 0
+    above = 0  # the first run in the row above that may touch
+    above_ends = 0
+    for row in range(height):
+        row_starts = run
+        column = 0
+        while column < width:
+            if mask[row, column] != value:
+                column += 1
                 continue
-            factor = along / max(norm2, np.float32(1e-6))
-            if shadow_darkest < factor < shadow_brightest:
-                across2 = zero
-                for channel in range(3):
-                    value = np.float32(image[row, column, channel]) * inverse_gain
-                    off = value - factor * mean[row, column, channel]
-                    across2 += off * off * weight[row, column, channel]
-                if across2 < shadow_threshold2:
-                    continue
-            mask[row, column] = 1
+            first = column
+            while column < width and mask[row, column] == value:
+                column += 1
+            runs[run, 0] = row
+            runs[run, 1] = first
+            runs[run, 2] = column
+            area[run] = column - first
+            if value == 0 and (row in (0, height - 1) or first == 0 or column == width):
+                area[run] = least_px  # reaches the border: not small
+            while above < above_ends and runs[above, 2] + reach <= first:
+                above += 1
+            other = above
+            while other < above_ends and runs[other, 1] < column + reach:
+                one = _root(parent, run)
+                two = _root(parent, other)
+                if one != two:
+                    parent[max(one, two)] = min(one, two)
+                    area[min(one, two)] += area[max(one, two)]
+                other += 1
+            run += 1
+        above = row_starts
+        above_ends = run
+    for run in range(n_runs):
+        if area[_root(parent, run)] < least_px:
+            mask[runs[run, 0], runs[run, 1] : runs[run, 2]] = 1 - value
+
+
+@compiled
+def _root(parent: NDArray[np.int64], node: int) -> int:
+    """Return the root of a node in a forest, and shorten the way there."""
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node

@@ -6,9 +6,10 @@ name only when it is complete.
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import h5py
 import numpy as np
@@ -21,6 +22,9 @@ VERSION = 1
 
 _STORED = {"compression": "gzip", "shuffle": True, "fletcher32": True, "track_times": False}
 
+#: What HDF5 raises on files that are damaged, and Python on what it then reads from them.
+_DAMAGED = (OSError, KeyError, ValueError, RuntimeError, TypeError, AttributeError)
+
 
 class SilhouetteWriter:
     """Takes in silhouettes frame by frame; the file appears when it is left without an error.
@@ -29,9 +33,9 @@ class SilhouetteWriter:
     ----------
     path : Path
         The file.
-    names : list of str
+    names : sequence of str
         The cameras, C of them.
-    sizes_px : list of (width, height)
+    sizes_px : sequence of (width, height)
         The size of each camera's images.
     stamp : str
         What the silhouettes were made from; see `hull.capture.recording.silhouette_stamp`.
@@ -43,7 +47,11 @@ class SilhouetteWriter:
     """
 
     def __init__(
-        self, path: Path, names: list[str], sizes_px: list[tuple[int, int]], stamp: str
+        self,
+        path: Path,
+        names: Sequence[str],
+        sizes_px: Sequence[tuple[int, int]],
+        stamp: str,
     ) -> None:
         self._path = path
         self._partial = path.with_name(path.name + ".partial")
@@ -52,11 +60,14 @@ class SilhouetteWriter:
         try:
             self._file = h5py.File(self._partial, "w")
         except OSError as error:
-            raise ReportError(f"{path}: cannot be written: {error}") from error
+            raise self._unwritable(error) from error
         self._file.attrs["format"] = FORMAT
         self._file.attrs["version"] = VERSION
-        for name, text in (("cameras", json.dumps(names)), ("stamp", stamp)):
-            self._file.create_dataset(name, data=text, track_times=False)
+        for key, text, description in (
+            ("cameras", json.dumps(list(names)), "names of the cameras, as JSON"),
+            ("stamp", stamp, "what the silhouettes were made from, as JSON"),
+        ):
+            _describe(self._file.create_dataset(key, data=text, track_times=False), description)
         self._masks = []
         for number, (width, height) in enumerate(sizes_px):
             row_bytes = -(-width // 8)
@@ -68,10 +79,9 @@ class SilhouetteWriter:
                 maxshape=(None, height, row_bytes),
                 **_STORED,
             )
+            _describe(dataset, "object pixels, eight a byte, the leftmost highest")
             dataset.attrs["camera"] = names[number]
             dataset.attrs["width_px"] = width
-            dataset.attrs["unit"] = "1"
-            dataset.attrs["description"] = "object pixels, eight a byte, the leftmost highest"
             self._masks.append(dataset)
 
     def append(self, masks: list[NDArray[np.uint8]] | None, reason: str = "") -> None:
@@ -79,14 +89,19 @@ class SilhouetteWriter:
 
         `masks` is None where a camera lacks the frame; `reason` says why.
         """
-        for number, dataset in enumerate(self._masks):
-            dataset.resize(len(self._reasons) + 1, axis=0)
-            if masks is None:
-                continue
-            width, height = self._sizes_px[number]
-            if masks[number].shape != (height, width):
-                raise ValueError(f"mask {number} is {masks[number].shape}, not {(height, width)}")
-            dataset[-1] = np.packbits(masks[number] > 0, axis=1)
+        if masks is not None:
+            for number, (mask, (width, height)) in enumerate(
+                zip(masks, self._sizes_px, strict=True)
+            ):
+                if mask.shape != (height, width):
+                    raise ValueError(f"mask {number} is {mask.shape}, not {(height, width)}")
+        try:
+            for number, dataset in enumerate(self._masks):
+                dataset.resize(len(self._reasons) + 1, axis=0)
+                if masks is not None:
+                    dataset[-1] = np.packbits(masks[number] > 0, axis=1)
+        except OSError as error:  # the disk is full
+            raise self._unwritable(error) from error
         self._reasons.append("" if masks is not None else reason or "a camera lacks this frame")
 
     def __enter__(self) -> Self:
@@ -99,19 +114,37 @@ class SilhouetteWriter:
         trace: TracebackType | None,
     ) -> None:
         """Complete the file, or remove what there is of it if something went wrong."""
-        if kind is not None:
-            self._file.close()
+        try:
+            if kind is None:
+                self._complete()
+            else:
+                self._file.close()
+        except OSError as failure:
+            raise self._unwritable(failure) from failure
+        finally:
             self._partial.unlink(missing_ok=True)
-            return
+
+    def _complete(self) -> None:
         texts = [reason.encode() for reason in self._reasons]
         kind_of_text = h5py.string_dtype("utf-8", max([1, *map(len, texts)]))
         reasons = self._file.create_dataset(
             "reason", data=np.array(texts, kind_of_text), track_times=False
         )
-        reasons.attrs["unit"] = "1"
-        reasons.attrs["description"] = "why a frame has no silhouettes; empty if it has"
+        _describe(reasons, "why a frame has no silhouettes; empty if it has")
         self._file.close()
         self._partial.replace(self._path)
+
+    def _unwritable(self, error: OSError) -> ReportError:
+        return ReportError(f"{self._path}: cannot be written: {_first_line(error)}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _describe(dataset: h5py.Dataset, description: str) -> None:
+    dataset.attrs["unit"] = "1"
+    dataset.attrs["description"] = description
 
 
 class SilhouetteReader:
@@ -155,7 +188,11 @@ class SilhouetteReader:
             self._reasons: list[str] = self._file["reason"].asstr()[:].tolist()
             self._masks = [self._file[f"masks/{number}"] for number in range(len(self.names))]
             self._widths_px = [int(dataset.attrs["width_px"]) for dataset in self._masks]
-        except (OSError, KeyError, ValueError) as error:
+            for dataset, width in zip(self._masks, self._widths_px, strict=True):
+                n_frames, _, row_bytes = dataset.shape
+                if (n_frames, row_bytes) != (len(self._reasons), -(-width // 8)):
+                    raise ValueError("sizes contradict each other")
+        except _DAMAGED as error:
             self._file.close()
             raise self._damaged(error) from error
         except ReportError:
@@ -175,14 +212,13 @@ class SilhouetteReader:
                 np.unpackbits(dataset[index], axis=1, count=width)
                 for dataset, width in zip(self._masks, self._widths_px, strict=True)
             ]
-        except OSError as error:
+        except _DAMAGED as error:
             raise self._damaged(error) from error
         return masks, ""
 
-    def _damaged(self, error: Any) -> ReportError:
-        text = str(error).splitlines()[0]
+    def _damaged(self, error: Exception) -> ReportError:
         return ReportError(
-            f"{self._path}: not readable silhouettes, or damaged ({text}); "
+            f"{self._path}: not readable silhouettes, or damaged ({_first_line(error)}); "
             "run `hybridve segment --overwrite`"
         )
 
