@@ -685,7 +685,6 @@ def _label_still_board(
             hand_i, hand_j = clips[i].hand_look, clips[j].hand_look
             if hand_i is not None and hand_j is not None:
                 votes[i, j, (hand_j - hand_i) % n_looks] += _HAND_VOTES
-            votes[j, i] = votes[i, j][-np.arange(n_looks) % n_looks]
         chosen = choose_looks(votes)
         looks = list(chosen.looks)
         names = [lens.camera.name for lens in lenses]

@@ -285,8 +285,12 @@ def choose_looks(votes: NDArray[np.float64]) -> LooksByVote:
     Parameters
     ----------
     votes : (C, C, L) float64
-        ``votes[i, j, k]``: for camera j to be k looks ahead of camera i.
+        ``votes[i, j, k]``: for camera j to be k looks ahead of camera i, for i < j; the others
+        are not read.
     """
+    votes = votes.copy()
+    for i, j in combinations(range(len(votes)), 2):
+        votes[j, i] = votes[i, j][-np.arange(votes.shape[2]) % votes.shape[2]]
     looks = _vote(votes)
     margins = tuple(_margin(votes, looks, {camera}) for camera in range(len(looks)))
     links = [_margin(votes, looks, side) for side in _sides(votes, looks)]

@@ -142,17 +142,10 @@ class Chessboard:
         Where ``corners`` place the board at ``cam_from_board``, ``corners[looks[look]]`` place it
         at ``cam_from_board`` after this motion.
         """
-        points = self.points_board
-        target = points[self.looks[look]]
         angle = 2.0 * np.pi * look / len(self.looks)
-        # np.rot90 turns the listing, not the board: the sense follows from the points themselves.
-        for sign in (1.0, -1.0):
-            cosine, sine = np.round(np.cos(angle)), sign * np.round(np.sin(angle))
-            rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-            shift = target[0] - rotation @ points[0]
-            if np.abs(points @ rotation.T + shift - target).max() < 1e-9 * self.square_m:
-                return np.column_stack([rotation, shift])
-        raise AssertionError("a look of the board is not a turn of it")
+        cosine, sine = np.round(np.cos(angle)), np.round(np.sin(angle))
+        rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        return np.column_stack([rotation, self.center_board - rotation @ self.center_board])
 
     def __str__(self) -> str:
         return f"{self.columns}x{self.rows} inner corners, {self.square_m * 1000:g} mm squares"

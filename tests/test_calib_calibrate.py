@@ -34,6 +34,7 @@ from hybridve.calib.calibrate import (
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import open_source
+from hybridve.calib.pose import compose
 from hybridve.calib.rig import Rig
 from hybridve.calib.target import Chessboard, find_corners
 
@@ -145,6 +146,10 @@ def test_somebody_who_crosses_the_clip_leaves_no_trace(recorded: Path) -> None:
     for camera in two_cameras():
         expected = project(camera, camera.cam_from_world, BOARD)
         assert np.abs(corners[camera.name] - expected).max() < 0.2
+    (seen, _) = observe_board(BOARD, inputs(recorded), SETTINGS)
+    assert seen.clip.picture is not None
+    without = render_board(two_cameras()[0], BOARD, samples=3).astype(float)
+    assert np.abs(seen.clip.picture - without).mean() < 2.0  # noise; the person would leave 10
 
 
 def test_a_board_that_moves_in_the_clip_is_noticed(recorded: Path, tmp_path: Path) -> None:
@@ -162,6 +167,22 @@ def test_a_board_that_moves_in_the_clip_is_noticed(recorded: Path, tmp_path: Pat
 
     assert [observed.clip.is_still for observed in seen] == [False, False]
     assert [sorted(observed.clip.corners) for observed in seen] == [[0, 1, 2, 3, 4]] * 2
+
+
+def test_a_board_that_is_nudged_does_not_lie_still(recorded: Path, tmp_path: Path) -> None:
+    for camera in two_cameras():
+        nudge = np.column_stack([np.eye(3), [0.012, 0.0, 0.0]])
+        poses = [camera.cam_from_world, compose(camera.cam_from_world, nudge)]
+        images = [render_board(camera, BOARD, pose, samples=2) for pose in poses]
+        write_images(tmp_path / camera.name, [images[number // 3] for number in range(6)])
+    nudged = [
+        replace(camera, extrinsics=open_source(tmp_path, f"{camera.name}/*.png"))
+        for camera in inputs(recorded)
+    ]
+
+    seen = observe_board(BOARD, nudged, SETTINGS)
+
+    assert not any(observed.clip.is_still for observed in seen)
 
 
 # --- Corners by hand --------------------------------------------------------------------------

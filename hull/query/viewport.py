@@ -152,13 +152,14 @@ def _fill_positions(
     sample: NDArray[np.uint32],
     positions: NDArray[np.float64],
 ) -> None:
-    last, row_end, j = -1, 0, 0
+    last = np.int64(-1)
+    row_end = j = np.int64(0)
     for hit in range(len(triangle)):
         t = np.int64(triangle[hit])
         number = np.int64(sample[hit])
         u = np.int64(viewports[t])
         if t != last or number < row_end - (u - j):
-            last, j, row_end = t, 0, u
+            last, j, row_end = t, np.int64(0), u
         while number >= row_end:  # rows are short, and hits come in order
             j += 1
             row_end += u - j
