@@ -370,8 +370,9 @@ def _weigh(
     height, width = open_questions.shape
     half = np.float32(0.5)
     varies2 = np.float32(_SHADE_VARIES * _SHADE_VARIES)
-    trusts = np.zeros(width, np.float32)  # sums over the rows of the window
-    shades = np.zeros(width, np.float32)
+    # Sums over the rows of the window; a margin of zeros on both sides saves looking for borders.
+    trusts = np.zeros(width + 2 * _SHADE_REACH_PX, np.float32)
+    shades = np.zeros(width + 2 * _SHADE_REACH_PX, np.float32)
     counts = np.zeros(_N_COLOURS, np.int64)
     n_counted = 0
     n_places = 0
@@ -396,21 +397,20 @@ def _weigh(
             stop += 1
         left = max(places[start, 1] - _SHADE_REACH_PX, 0)
         right = min(places[stop - 1, 1] + _SHADE_REACH_PX + 1, width)
-        trusts[left:right] = 0
-        shades[left:right] = 0
+        trusts[left + _SHADE_REACH_PX : right + _SHADE_REACH_PX] = 0
+        shades[left + _SHADE_REACH_PX : right + _SHADE_REACH_PX] = 0
         for other in range(max(row - _SHADE_REACH_PX, 0), min(row + _SHADE_REACH_PX + 1, height)):
             for column in range(left, right):
-                trusts[column] += trust[other, column]
-                shades[column] += trust[other, column] * shade[other, column]
+                value = trust[other, column]
+                trusts[column + _SHADE_REACH_PX] += value
+                shades[column + _SHADE_REACH_PX] += value * shade[other, column]
         for place in range(start, stop):
             column = places[place, 1]
             trust_around = np.float32(0.0)
             shade_around = np.float32(0.0)
-            for other in range(
-                max(column - _SHADE_REACH_PX, 0), min(column + _SHADE_REACH_PX + 1, width)
-            ):
-                trust_around += trusts[other]
-                shade_around += shades[other]
+            for step in range(2 * _SHADE_REACH_PX + 1):
+                trust_around += trusts[column + step]
+                shade_around += shades[column + step]
             texture2 = np.float32(0.0)
             if trust_around > 0:
                 off = shade[row, column] - shade_around / trust_around
