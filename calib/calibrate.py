@@ -138,7 +138,7 @@ _STILL_GREY = 8.0
 _CLIP_BYTES = 200_000_000
 
 #: An order of corners that was given by hand counts as this many agreeing matches of the scene.
-_HAND_VOTES = 6.0
+_HAND_VOTES = 10.0
 
 #: Evidence below this many standard deviations (of counts of chance matches) is called weak.
 _WEAK_EVIDENCE = 3.0
@@ -762,7 +762,10 @@ def _adjust_all(
 ) -> tuple[tuple[Camera, ...], Adjustment, list[BoardView], int]:
     """Return cameras in the world, the adjustment, its views, and how many are of the clips."""
     cameras, boards, views = link_cameras(
-        board, [lens.camera for lens in lenses], [clip.corners for clip in clips]
+        board,
+        [lens.camera for lens in lenses],
+        [clip.corners for clip in clips],
+        is_labelled=all(clip.is_still for clip in clips),
     )
     n_common = len(views)
     common_frames = [view.frame for view in views]

@@ -11,7 +11,7 @@ everyone should know to improve object retrieval*, CVPR 2012 (RootSIFT).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import cv2
@@ -279,8 +279,8 @@ class LooksByVote:
 def choose_looks(votes: NDArray[np.float64]) -> LooksByVote:
     """Choose the looks for which the votes of all pairs of cameras add up to most.
 
-    Pairs are joined in the order of their certainty; then single cameras, and sides of the tree
-    of joined pairs, are turned as long as that gains votes.
+    The surest pairs, as a tree that joins all cameras, give a start; then single cameras and
+    sides of the tree are turned as long as that gains votes.
 
     Parameters
     ----------
@@ -288,43 +288,55 @@ def choose_looks(votes: NDArray[np.float64]) -> LooksByVote:
         ``votes[i, j, k]``: for camera j to be k looks ahead of camera i, for i < j; the others
         are not read.
     """
-    votes = votes.copy()
-    for i, j in combinations(range(len(votes)), 2):
-        votes[j, i] = votes[i, j][-np.arange(votes.shape[2]) % votes.shape[2]]
-    looks = _vote(votes)
-    margins = tuple(_margin(votes, looks, {camera}) for camera in range(len(looks)))
-    links = [_margin(votes, looks, side) for side in _sides(votes, looks)]
-    return LooksByVote(tuple(looks), margins, min([*margins, *links], default=np.inf))
-
-
-def _vote(votes: NDArray[np.float64]) -> list[int]:
     n_cameras, _, n_looks = votes.shape
-    groups: list[dict[int, int]] = [{camera: 0} for camera in range(n_cameras)]
-    while len(groups) > 1:
-        best: tuple[float, int, int, int] | None = None
-        for a, b in combinations(range(len(groups)), 2):
-            totals = np.zeros(n_looks)
-            for i, look_i in groups[a].items():
-                for j, look_j in groups[b].items():
-                    totals += np.roll(votes[i, j], look_i - look_j)
-            ranked = np.sort(totals)
-            lead = float(_sigmas(ranked[-1], ranked[-2]))
-            if best is None or lead > best[0] + 1e-12:
-                best = (lead, a, b, int(np.argmax(totals)))
-        assert best is not None
-        _, a, b, ahead = best
-        merged = groups[a] | {j: (look + ahead) % n_looks for j, look in groups[b].items()}
-        groups = [group for index, group in enumerate(groups) if index not in (a, b)] + [merged]
-    looks = [groups[0][camera] for camera in range(n_cameras)]
+    tree = _surest_tree(votes)
+    looks = [0] * n_cameras
+    reached = {0}
+    while len(reached) < n_cameras:
+        i, j = next((i, j) for i, j in tree if (i in reached) != (j in reached))
+        ahead = int(np.argmax(votes[i, j]))
+        if i in reached:
+            looks[j] = (looks[i] + ahead) % n_looks
+        else:
+            looks[i] = (looks[j] - ahead) % n_looks
+        reached |= {i, j}
+    singles = [{camera} for camera in range(n_cameras)]
+    sides = singles + [_side(tree, cut) for cut in tree]
     gains = True
     while gains:
         gains = False
-        for side in [{camera} for camera in range(n_cameras)] + _sides(votes, looks):
-            for ahead in range(1, n_looks):
-                turned = _turned(looks, side, ahead, n_looks)
-                if _total(votes, turned) > _total(votes, looks):
-                    looks, gains = turned, True
-    return looks
+        for side, ahead in product(sides, range(1, n_looks)):
+            turned = _turned(looks, side, ahead, n_looks)
+            if _total(votes, turned) > _total(votes, looks):
+                looks, gains = turned, True
+    margins = [_margin(votes, looks, side) for side in sides]
+    return LooksByVote(tuple(looks), tuple(margins[:n_cameras]), min(margins))
+
+
+def _surest_tree(votes: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Return the pairs that join all cameras with the greatest lead of votes (Kruskal)."""
+
+    def lead(pair: tuple[int, int]) -> float:
+        ranked = np.sort(votes[pair])
+        return _sigmas(ranked[-1], ranked[-2])
+
+    part = list(range(len(votes)))
+    tree = []
+    for i, j in sorted(combinations(range(len(votes)), 2), key=lead, reverse=True):
+        if part[i] != part[j]:
+            tree.append((i, j))
+            part = [part[i] if value == part[j] else value for value in part]
+    return tree
+
+
+def _side(tree: Sequence[tuple[int, int]], cut: tuple[int, int]) -> set[int]:
+    """Return the cameras on one side of a tree that is cut at one of its pairs."""
+    side = {cut[0]}
+    for _ in tree:
+        for i, j in tree:
+            if (i, j) != cut and (i in side) != (j in side):
+                side |= {i, j}
+    return side
 
 
 def _turned(looks: Sequence[int], side: set[int], ahead: int, n_looks: int) -> list[int]:
@@ -336,33 +348,6 @@ def _turned(looks: Sequence[int], side: set[int], ahead: int, n_looks: int) -> l
 def _total(votes: NDArray[np.float64], looks: Sequence[int]) -> float:
     pairs = combinations(range(len(looks)), 2)
     return float(sum(votes[i, j, (looks[j] - looks[i]) % votes.shape[2]] for i, j in pairs))
-
-
-def _sides(votes: NDArray[np.float64], looks: Sequence[int]) -> list[set[int]]:
-    """Return the two-part splits of the cameras along the tree of their surest pairs."""
-    n_cameras = len(looks)
-    edges = sorted(
-        combinations(range(n_cameras), 2),
-        key=lambda edge: (
-            -votes[edge[0], edge[1], (looks[edge[1]] - looks[edge[0]]) % votes.shape[2]]
-        ),
-    )
-    part = list(range(n_cameras))
-    tree = []
-    for i, j in edges:
-        if part[i] != part[j]:
-            tree.append((i, j))
-            old, new = part[j], part[i]
-            part = [new if value == old else value for value in part]
-    sides = []
-    for cut in tree:
-        side = {cut[0]}
-        for _ in tree:
-            for i, j in tree:
-                if (i, j) != cut and (i in side) != (j in side):
-                    side |= {i, j}
-        sides.append(side)
-    return sides
 
 
 def _sigmas(more: float, less: float) -> float:

@@ -35,6 +35,13 @@ _SEED_VIEWS = 12
 #: Turns of fitting and dropping; a handful is usual.
 _MAX_TURNS = 50
 
+#: Relative poses further apart than this come from different looks of the board. The right one
+#: must fit the common frames better than others by a factor and a margin (radians, and shares of
+#: the cameras' distance).
+_OTHER_LOOK_RAD = 0.5
+_CLEAR_FACTOR = 3.0
+_CLEAR_MARGIN = 0.05
+
 #: The adjustment has converged when the gradient is below this (pixels squared a unit); the
 #: default of 1e-4 stops at a relative error of about 1e-5 on noise-free corners.
 _GRADIENT_TOLERANCE = 1e-10
@@ -471,12 +478,12 @@ def link_cameras(
     board: Chessboard,
     cameras: Sequence[Camera],
     corners: Sequence[dict[int, NDArray[np.float64]]],
+    is_labelled: bool,
 ) -> tuple[list[Camera], dict[int, Pose], list[BoardView]]:
     """Chain cameras that see a board at the same time, by closed-form poses.
 
     A board that looks the same when turned is listed in each view as it agrees with the others:
-    the true relative pose of two cameras is the one that all their common frames share. With one
-    common frame the listings are taken as they stand.
+    the true relative pose of two cameras is the one that all their common frames share.
 
     Parameters
     ----------
@@ -486,6 +493,8 @@ def link_cameras(
         Lenses; poses are not used.
     corners : sequence of dict of int to (N, 2) float64
         For each camera, by frame, the corners it sees in pixels.
+    is_labelled : bool
+        Whether a symmetric board is listed consistently already.
 
     Returns
     -------
@@ -499,9 +508,11 @@ def link_cameras(
     Raises
     ------
     CalibrationError
-        If a camera shares no frame with those it could be linked to.
+        If a camera shares no frame with those it could be linked to, or the common frames do not
+        tell which way round they saw the board.
     """
     points = board.points_board
+    n_looks = 1 if is_labelled else len(board.looks)
     located: list[dict[int, Pose]] = []
     for camera, seen in zip(cameras, corners, strict=True):
         found = {frame: locate_board(camera, points, pixels) for frame, pixels in seen.items()}
@@ -518,7 +529,16 @@ def link_cameras(
         n_shared, known, new = max(edges)
         if n_shared == 0:
             raise _not_linked(cameras, set(cam_from_rig))
-        new_from_known = _common_relative_pose(board, located[-known], located[-new])
+        new_from_known, is_clear = _common_relative_pose(
+            board, n_looks, located[-known], located[-new]
+        )
+        if not is_clear:
+            raise CalibrationError(
+                f"cameras {cameras[-known].name!r} and {cameras[-new].name!r}: their {n_shared} "
+                "common views of a board that looks the same when turned do not tell which way "
+                "round they saw it; tilt and move the board more, let it lie still, or use one "
+                "with an odd sum of columns and rows"
+            )
         cam_from_rig[-new] = compose(new_from_known, cam_from_rig[-known])
 
     rig_from_board: dict[int, Pose] = {}
@@ -529,9 +549,9 @@ def link_cameras(
                 continue
             look = 0
             from_cam = invert(cam_from_rig[index])
-            if frame in rig_from_board and len(board.looks) > 1:
+            if frame in rig_from_board and n_looks > 1:
                 look = min(
-                    range(len(board.looks)),
+                    range(n_looks),
                     key=lambda turn: angle_between(
                         compose(from_cam, compose(poses[frame], board.board_from_turned(turn))),
                         rig_from_board[frame],
@@ -558,13 +578,11 @@ def _not_linked(cameras: Sequence[Camera], linked: set[int]) -> CalibrationError
 
 
 def _common_relative_pose(
-    board: Chessboard, first: dict[int, Pose], second: dict[int, Pose]
-) -> Pose:
-    """Return second_from_first, as most of the common frames have it."""
+    board: Chessboard, n_looks: int, first: dict[int, Pose], second: dict[int, Pose]
+) -> tuple[Pose, bool]:
+    """Return second_from_first, as most of the common frames have it, and if no other serves."""
     shared = sorted(first.keys() & second.keys())
-    turns = [board.board_from_turned(look) for look in range(len(board.looks))]
-    if len(shared) == 1:
-        turns = turns[:1]
+    turns = [board.board_from_turned(look) for look in range(n_looks)]
     candidates = [
         [compose(compose(second[frame], turn), invert(first[frame])) for turn in turns]
         for frame in shared
@@ -587,4 +605,7 @@ def _common_relative_pose(
             )
         )
 
-    return min((pose for frame in candidates for pose in frame), key=disagreement)
+    errors = [(disagreement(pose), pose) for frame in candidates for pose in frame]
+    error, best = min(errors, key=lambda item: item[0])
+    rivals = [other for other, pose in errors if angle_between(pose, best) > _OTHER_LOOK_RAD]
+    return best, min(rivals, default=np.inf) > _CLEAR_FACTOR * error + _CLEAR_MARGIN

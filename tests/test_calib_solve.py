@@ -239,6 +239,16 @@ def test_frames_tell_which_way_round_a_symmetric_board_was_seen() -> None:
     np.testing.assert_allclose(distances, 0.12, rtol=EXACT)
 
 
+def test_frames_that_do_not_tell_which_way_round_are_refused() -> None:
+    board = Chessboard(8, 6, 0.1)
+    cameras = side_by_side("PINHOLE")
+    observations, _ = moving(board, cameras)
+    corners = [{0: seen.clip.corners[0], 1: seen.clip.corners[0]} for seen in observations]
+
+    with pytest.raises(CalibrationError, match=r"'cam0' and .* do not tell which way round"):
+        link_cameras(board, cameras, corners, is_labelled=False)
+
+
 def test_cameras_are_linked_through_others() -> None:
     cameras = side_by_side("PINHOLE")
     observations, _ = moving(BOARD, cameras)
@@ -272,7 +282,7 @@ def test_a_camera_that_cannot_be_linked_is_named() -> None:
     corners[2] = {frame: corners[2][frame] for frame in frames[6:]}
 
     with pytest.raises(CalibrationError, match="camera 'cam2' never sees the board at the same"):
-        link_cameras(BOARD, cameras, corners)
+        link_cameras(BOARD, cameras, corners, is_labelled=False)
 
 
 # --- Parts -----------------------------------------------------------------------------------
