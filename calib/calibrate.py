@@ -361,8 +361,9 @@ def _observe_stills(
     source = camera.intrinsics
     if source is None or (camera.extrinsics and source.paths == camera.extrinsics.paths):
         return Stills(None, {}, {})  # the views of the extrinsic clip serve
-    step = -(-max(1, source.claimed_length()) // settings.max_stills)
-    total = -(-max(1, source.claimed_length()) // step)
+    length = _length(source)
+    step = -(-length // settings.max_stills)
+    total = -(-length // step)
     sizes: dict[str, tuple[int, int]] = {}
     corners: dict[str, NDArray[np.float64]] = {}
     missed: dict[str, str] = {}
@@ -406,6 +407,12 @@ def _observe_stills(
     return Stills(size_px, corners, missed)
 
 
+def _length(source: FrameSource) -> int:
+    """Return how many frames there are, about; some videos do not say."""
+    claimed = source.claimed_length()
+    return claimed if claimed > 0 else max(1, source.count())
+
+
 def _observe_clips(
     board: Chessboard,
     cameras: Sequence[CameraInput],
@@ -415,8 +422,7 @@ def _observe_clips(
 ) -> list[Clip]:
     sources = [camera.extrinsics for camera in cameras if camera.extrinsics is not None]
     # One step for all cameras: frames with the same number were taken at the same time.
-    length = max(1, min(source.claimed_length() for source in sources))
-    step = -(-length // settings.clip_frames)
+    step = -(-min(map(_length, sources)) // settings.clip_frames)
     still = [
         pool.submit(_observe_still_clip, board, camera, source, step, settings)
         for camera, source in zip(cameras, sources, strict=True)

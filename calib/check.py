@@ -148,7 +148,7 @@ def _floor_features(
     # A lens polynomial folds back far outside the image: the pixel must lead back to the point.
     rays = np.full((len(points), 2), np.nan)
     rays[seen] = cam_from_img(camera, pixels[seen])
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         expected = points_cam[:, :2] / points_cam[:, 2:]
         seen &= np.linalg.norm(rays - expected, axis=1) < 1e-3
     pixels[~seen] = -1e3
