@@ -24,7 +24,7 @@ from hybridve.calib.errors import SessionError
 from hybridve.calib.image_io import FrameSource, Image
 from hybridve.calib.lens import Undistortion
 from hybridve.hull.capture.background import learn_background
-from hybridve.hull.capture.segment import Segmenter, threshold_mask
+from hybridve.hull.capture.segment import METHOD_VERSION, Segmenter, threshold_mask
 from hybridve.hull.capture.session import Session, SessionCamera
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 
@@ -236,6 +236,7 @@ def silhouette_stamp(session: Session, rig_digest: str | None) -> str:
                 files.append([str(path), status.st_size, status.st_mtime_ns])
     return json.dumps(
         {
+            "method": METHOD_VERSION,
             "segmentation": asdict(session.segmentation),
             "mask_threshold": session.mask_threshold,
             "rig": rig_digest,

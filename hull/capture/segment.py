@@ -80,6 +80,11 @@ _EVIDENCE_LIMIT = 6.0
 _EVIDENCE_STEPS = 20.0
 
 
+#: Counted up whenever the same frames and settings give other silhouettes than before, so that
+#: stored ones are known to be stale.
+METHOD_VERSION = 1
+
+
 @dataclass(frozen=True, slots=True)
 class SegmentSettings:
     """How objects are told from the empty scene: the ``[segmentation]`` table of a session.
