@@ -294,8 +294,14 @@ def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
     session = write_ball_session(tmp_path / "session", centers, n_cameras=2)
     path, whole = tmp_path / "report.h5", tmp_path / "whole.h5"
     arguments = ["detect", str(session), "--scene", str(scene), "--engine", "reference"]
+    arguments += ["--viewport", "40", "--no-progress"]  # slow enough to be interrupted
+    # A shell that starts the tests in the background has them ignore the signal; here it counts.
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from hybridve.cli.main import main; main()"
+    )
     process = subprocess.Popen(
-        [sys.executable, "-m", "hybridve.cli", *arguments, "-o", str(path), "--no-progress"],
+        [sys.executable, "-c", code, *arguments, "-o", str(path)],
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
