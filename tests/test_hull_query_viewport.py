@@ -101,6 +101,17 @@ def test_hits_are_positioned_to_the_bits_of_the_specification(seed: int, largest
             vertices[faces[triangle[chosen]]], viewports[triangle[chosen]], sample[chosen]
         )
 
-        found = hit_positions(vertices, faces, viewports, triangle[chosen], sample[chosen])
+        found = [
+            hit_positions(
+                vertices,
+                faces,
+                viewports,
+                triangle[chosen],
+                sample[chosen],
+                np.zeros((len(chosen), 3), dtype),
+            )
+            for dtype in (np.float64, np.float32)
+        ]
 
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(found[0], expected)
+        np.testing.assert_array_equal(found[1], expected.astype(np.float32))

@@ -15,7 +15,7 @@ from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.engine import Engine, Hits, Triangles
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.viewport import hit_positions, viewports_for_accuracy
+from hybridve.hull.query.viewport import Real, hit_positions, viewports_for_accuracy
 
 #: "colliding": a sample of the surface is inside every silhouette. "free": proved, no point of the
 #: object is in the hull. "": only sampled; a smaller contact may hide between the samples.
@@ -126,18 +126,18 @@ def detect_contacts(hull: Hull, bodies: list[Body], engine: Engine) -> list[Cont
 def _contact(hull: Hull, body: Body, hits: Hits, otherwise: Certificate) -> Contact:
     if len(hits) == 0:
         return Contact(otherwise, np.zeros((0, 3), np.float32), hits.triangle)
-    triangles = body.triangles
-    points_world = hit_positions(
-        triangles.vertices_world,
-        triangles.faces,
-        triangles.viewports,
-        hits.triangle,
-        hits.sample,
-    )
     # An engine in single precision may err at the rim of a silhouette; a witness may not.
-    has_witness = bool(contains_points(hull, points_world[:_MAX_WITNESSES]).any())
-    return Contact(
-        "colliding" if has_witness else "", points_world.astype(np.float32), hits.triangle
+    few = Hits(hits.triangle[:_MAX_WITNESSES], hits.sample[:_MAX_WITNESSES])
+    witnesses_world = _place(body, few, np.zeros((len(few), 3)))
+    has_witness = bool(contains_points(hull, witnesses_world).any())
+    points_world = _place(body, hits, np.zeros((len(hits), 3), np.float32))
+    return Contact("colliding" if has_witness else "", points_world, hits.triangle)
+
+
+def _place(body: Body, hits: Hits, positions: NDArray[Real]) -> NDArray[Real]:
+    mesh = body.triangles
+    return hit_positions(
+        mesh.vertices_world, mesh.faces, mesh.viewports, hits.triangle, hits.sample, positions
     )
 
 

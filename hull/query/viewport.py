@@ -14,10 +14,14 @@ Samples are numbered row by row, j = 0 first: sample (i, j) is number ``j u - j 
 An engine returns numbers; positions come from here alone.
 """
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import compiled
+
+Real = TypeVar("Real", np.float32, np.float64)
 
 #: More samples an edge than a 16-bit image is wide serve nobody, and their count stays below 2^31.
 MAX_VIEWPORT = 65_535
@@ -119,7 +123,8 @@ def hit_positions(
     viewports: NDArray[np.int32],
     triangle: NDArray[np.uint32],
     sample: NDArray[np.uint32],
-) -> NDArray[np.float64]:
+    positions: NDArray[Real],
+) -> NDArray[Real]:
     """Return where the samples of a mesh lie: `sample_positions`, compiled, to the same bits.
 
     Parameters
@@ -132,13 +137,14 @@ def hit_positions(
         The viewport of each triangle.
     triangle, sample : (P,) uint32
         Triangles, and numbers of samples in their viewports.
+    positions : (P, 3) float64 or float32
+        Where to write them: millions of points cost more to allocate twice than to compute.
 
     Returns
     -------
-    (P, 3) float64
-        Positions in the frame of the vertices.
+    (P, 3) float64 or float32
+        `positions`, in the frame of the vertices, computed in double precision.
     """
-    positions = np.zeros((len(triangle), 3))
     _fill_positions(vertices, faces, viewports, triangle, sample, positions)
     return positions
 
@@ -150,7 +156,7 @@ def _fill_positions(
     viewports: NDArray[np.int32],
     triangle: NDArray[np.uint32],
     sample: NDArray[np.uint32],
-    positions: NDArray[np.float64],
+    positions: NDArray[Real],
 ) -> None:
     last = np.int64(-1)
     row_end = j = np.int64(0)
