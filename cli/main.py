@@ -56,6 +56,10 @@ def cli(verbose: int, quiet: bool) -> None:
 for command in (demo, synth, calibrate, segment, detect, summary, render, doctor):
     cli.add_command(command)
 
+for command in (cli, *cli.commands.values()):
+    # click keeps the lines after a backspace character as they are; raw docstrings spell it out.
+    command.help = (command.help or "").replace("\\b", "\b")
+
 
 def main() -> NoReturn:
     """Run the command line and leave with its exit status."""

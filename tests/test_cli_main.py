@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from hybridve.calib.errors import HybridveError
 from hybridve.cli.main import cli
@@ -24,6 +25,18 @@ def test_every_command_is_in_the_readme_and_its_help_tells_what_it_does(name: st
     assert command.short_help
     if any(isinstance(parameter, click.Argument) for parameter in command.params):
         assert f"hybridve {name} " in command.help.split("Example:")[1]
+
+
+@pytest.mark.parametrize("name", ["", *cli.commands])
+def test_examples_in_help_keep_their_lines(name: str) -> None:
+    shown = CliRunner().invoke(cli, [*name.split(), "--help"]).output
+
+    assert "\\b" not in shown
+    assert "\b" not in shown
+    if "Example:" in shown:
+        example = shown.split("Example:")[1].splitlines()
+        assert example[0] == ""
+        assert example[1].strip().startswith("hybridve ")
 
 
 @pytest.mark.parametrize("name", list(cli.commands))

@@ -42,7 +42,7 @@ def open_device(device_index: int | None = None) -> moderngl.Context:
         raise DeviceError(
             f"no OpenGL 4.3 through {wanted} ({error}); expected a graphics driver or software "
             "rendering: install libegl1 and libgl1-mesa-dri "
-            "(apt-get install libegl1 libgl1-mesa-dri), or take --engine native"
+            "(apt-get install libegl1 libgl1-mesa-dri); detect does without: --engine native"
         ) from error
     context.gc_mode = "context_gc"  # what Python drops is released by context.gc(), by the owner
     return context
