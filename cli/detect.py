@@ -111,6 +111,8 @@ def detect(
                 for result in results:
                     writer.append(result)
                     advance()
+            if progress:
+                click.echo(f"writing {output}", err=True)
             writer.finish()
     report = read_report(output)
     print_summary(report)
