@@ -6,7 +6,6 @@ where its pixel centres lie, the images' size) is given by the caller, never gue
 """
 
 import json
-import struct
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.camera import N_PARAMS, Camera
+from hybridve.calib.camera import Camera
+from hybridve.calib.colmap_io import read_colmap_model
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose
 from hybridve.calib.rig import Rig
@@ -619,95 +619,15 @@ def _stereo_pair(path: Path, entries: dict[str, Any], names: list[str]) -> list[
 
 
 def _read_colmap_folder(folder: Path) -> list[_Foreign]:
-    """Read cameras and images of a COLMAP model, binary or text.
-
-    Rigs and frames need not be read: COLMAP writes each image's own pose as well. (pycolmap is
-    not used here, since rigs are also read where nothing is solved.)
-    """
-    try:
-        if (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file():
-            lenses = _colmap_cameras_bin((folder / "cameras.bin").read_bytes())
-            images = _colmap_images_bin((folder / "images.bin").read_bytes())
-        elif (folder / "cameras.txt").is_file() and (folder / "images.txt").is_file():
-            lenses = _colmap_cameras_txt((folder / "cameras.txt").read_text(encoding="utf-8"))
-            images = _colmap_images_txt((folder / "images.txt").read_text(encoding="utf-8"))
-        else:
-            raise CalibrationError(
-                f"{folder}: not a COLMAP model; expected cameras and images, .bin or .txt"
-            )
-        cameras = []
-        for name, camera_id, quaternion, translation in images:
-            model, size_px, params = lenses[camera_id]
-            pose = np.column_stack([_rotation_from_quaternion(quaternion), translation])
-            cameras.append(_Foreign(name, model, params, pose, 0.0, size_px))
-    except (struct.error, ValueError, IndexError, KeyError) as error:
-        raise CalibrationError(f"{folder}: not a whole COLMAP model ({error})") from error
-    if not cameras:
-        raise CalibrationError(f"{folder}: the COLMAP model holds no image with a pose")
-    return cameras
-
-
-_ColmapLens = tuple[str, tuple[int, int], NDArray[np.float64]]
-_ColmapImage = tuple[str, int, NDArray[np.float64], NDArray[np.float64]]
-
-
-def _colmap_cameras_txt(text: str) -> dict[int, _ColmapLens]:
-    lenses = {}
-    for line in text.splitlines():
-        words = line.split()
-        if words and not line.startswith("#"):
-            params = np.array([float(word) for word in words[4:]])
-            lenses[int(words[0])] = (words[1], (int(words[2]), int(words[3])), params)
-    return lenses
-
-
-def _colmap_images_txt(text: str) -> list[_ColmapImage]:
-    # Two lines an image; the second one, its points, may be empty.
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    images = []
-    for line in lines[::2]:
-        words = line.split(maxsplit=9)
-        if len(words) == 10:
-            numbers = np.array([float(word) for word in words[1:8]])
-            images.append((words[9].strip(), int(words[8]), numbers[:4], numbers[4:]))
-    return images
-
-
-def _colmap_cameras_bin(data: bytes) -> dict[int, _ColmapLens]:
-    (count,), offset = struct.unpack_from("<Q", data), 8
-    lenses = {}
-    for _ in range(count):
-        camera_id, model_id, width, height = struct.unpack_from("<IiQQ", data, offset)
-        offset += 24
-        if model_id not in _COLMAP_MODEL_IDS:
-            raise ValueError(f"unknown camera model {model_id}")
-        model = _COLMAP_MODEL_IDS[model_id]
-        params = np.array(struct.unpack_from(f"<{N_PARAMS[model]}d", data, offset))
-        offset += 8 * N_PARAMS[model]
-        lenses[camera_id] = (model, (width, height), params)
-    return lenses
-
-
-def _colmap_images_bin(data: bytes) -> list[_ColmapImage]:
-    (count,), offset = struct.unpack_from("<Q", data), 8
-    images = []
-    for _ in range(count):
-        numbers = np.array(struct.unpack_from("<7d", data, offset + 4))
-        (camera_id,) = struct.unpack_from("<I", data, offset + 60)
-        end = data.index(b"\0", offset + 64)
-        name = data[offset + 64 : end].decode("utf-8")
-        (n_points,) = struct.unpack_from("<Q", data, end + 1)
-        offset = end + 9 + 24 * n_points
-        images.append((name, camera_id, numbers[:4], numbers[4:]))
-    return images
-
-
-def _rotation_from_quaternion(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """Read the cameras of a COLMAP model, binary or text."""
+    return [
+        _Foreign(
+            camera.name,
+            camera.model,
+            camera.params,
+            camera.cam_from_world,
+            0.0,
+            (camera.width_px, camera.height_px),
+        )
+        for camera in read_colmap_model(folder).cameras
+    ]
