@@ -244,10 +244,14 @@ def test_the_hull_of_the_dinosaur_fills_its_known_box() -> None:
 
     points = inside(hull, (-0.1, -0.06, -0.1), (0.06, 0.11, 0.06), 0.001)
 
-    # The published tight box, to 8 mm: the feet are cut off by the image in some views, and from
-    # below, where no camera looks, the hull bulges.
-    np.testing.assert_allclose(points.min(axis=0), [-0.0619, -0.0189, -0.0578], atol=0.008)
-    np.testing.assert_allclose(points.max(axis=0), [0.0109, 0.0682, 0.0155], atol=0.008)
+    # A visual hull contains the thing. It may fall short of the published tight box by the step
+    # of 1 mm and by what thresholding loses of dark rims (the publisher grows its masks by 3 px
+    # for that, 0.6 mm each); 3.0 mm are lost at one face.
+    box = np.array([[-0.0619, -0.0189, -0.0578], [0.0109, 0.0682, 0.0155]])
+    beyond_m = np.array([box[0] - points.min(axis=0), points.max(axis=0) - box[1]])
+    assert beyond_m.min() > -0.004
+    # It may also bulge: 6.6 mm below the feet were found, the cause of which is not known.
+    assert beyond_m.max() < 0.008
 
 
 def test_every_dataset_of_a_real_report_is_readable(
