@@ -39,7 +39,8 @@ def test_samples_in_all_tangent_cones_of_a_ball_are_inside(engine: Engine, shift
 
     n_samples = viewport * (viewport + 1) // 2
     found = np.zeros(len(mesh) * n_samples, np.bool_)
-    found[hits.triangle.astype(np.int64) * n_samples + hits.sample] = True
+    triangle, sample = hits.samples()
+    found[triangle.astype(np.int64) * n_samples + sample] = True
     positions = sample_positions(
         np.repeat(mesh.corners_world, n_samples, axis=0),
         np.full(len(found), viewport, np.int32),

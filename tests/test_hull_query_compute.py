@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.hulls import (
     EDGE_BAND_PX,
+    assert_same_samples,
     ball_hull,
     differences,
     is_in_order,
@@ -148,9 +149,7 @@ def test_meshes_are_told_apart(compute: Compute) -> None:
     assert [len(hits) > 0 for hits in found] == [True, False, False, True, False]
     for mesh, hits, expected_hits in zip(meshes, found, expected, strict=True):
         assert is_in_order(mesh, hits)
-        np.testing.assert_array_equal(hits.sample, expected_hits.sample)
-        np.testing.assert_array_equal(hits.triangle, expected_hits.triangle)
-        assert hits.triangle.dtype == hits.sample.dtype == np.uint32
+        assert_same_samples(hits, expected_hits)
 
 
 def test_no_meshes_is_no_hits(compute: Compute) -> None:
@@ -167,7 +166,7 @@ def test_buffers_grow_when_a_frame_overflows_them(
         (found,) = engine.query(hull, [mesh])
 
     (expected,) = native.query(hull, [mesh])
-    np.testing.assert_array_equal(found.sample, expected.sample)
+    assert_same_samples(found, expected)
     assert len(found) == len(mesh) * 70 * 71 // 2  # all of it is inside
 
 
@@ -182,8 +181,7 @@ def test_a_frame_too_large_for_the_device_is_asked_in_parts(context: moderngl.Co
         engine._upload = uploads
 
     for hits, expected in zip(found, native.query(hull, meshes), strict=True):
-        np.testing.assert_array_equal(hits.triangle, expected.triangle)
-        np.testing.assert_array_equal(hits.sample, expected.sample)
+        assert_same_samples(hits, expected)
 
 
 def test_a_triangle_too_large_for_the_device_is_named(context: moderngl.Context) -> None:

@@ -125,6 +125,7 @@ def test_samples_are_asked_across_chunks_in_order(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(reference, "_CHUNK", chunk)
         (hits,) = Reference().query(hull, [mesh])
 
-        assert hits.triangle.tolist() == expected_triangle
-        assert hits.sample.tolist() == expected_sample
-        assert hits.triangle.dtype == hits.sample.dtype == np.uint32
+        triangle, sample = hits.samples()
+        assert triangle.tolist() == expected_triangle
+        assert sample.tolist() == expected_sample
+        assert triangle.dtype == sample.dtype == np.uint32

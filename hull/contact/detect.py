@@ -116,28 +116,37 @@ def detect_contacts(hull: Hull, bodies: list[Body], engine: Engine) -> list[Cont
     )
     near = [body for body, is_free in zip(bodies, free, strict=True) if not is_free]
     hits = iter(engine.query(hull, [body.triangles for body in near]))
-    none = Hits(np.zeros(0, np.uint32), np.zeros(0, np.uint32))
     return [
-        _contact(hull, body, none, "free") if is_free else _contact(hull, body, next(hits), "")
+        _no_contact("free") if is_free else _contact(hull, body, next(hits))
         for body, is_free in zip(bodies, free, strict=True)
     ]
 
 
-def _contact(hull: Hull, body: Body, hits: Hits, otherwise: Certificate) -> Contact:
+def _no_contact(certificate: Certificate) -> Contact:
+    return Contact(certificate, np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+
+
+def _contact(hull: Hull, body: Body, hits: Hits) -> Contact:
     if len(hits) == 0:
-        return Contact(otherwise, np.zeros((0, 3), np.float32), hits.triangle)
+        return _no_contact("")
+    triangle, sample = hits.samples()
     # An engine in single precision may err at the rim of a silhouette; a witness may not.
-    few = Hits(hits.triangle[:_MAX_WITNESSES], hits.sample[:_MAX_WITNESSES])
-    witnesses_world = _place(body, few, np.zeros((len(few), 3)))
+    few = slice(0, _MAX_WITNESSES)
+    witnesses_world = _place(body, triangle[few], sample[few], np.zeros((len(triangle[few]), 3)))
     has_witness = bool(contains_points(hull, witnesses_world).any())
-    points_world = _place(body, hits, np.zeros((len(hits), 3), np.float32))
-    return Contact("colliding" if has_witness else "", points_world, hits.triangle)
+    points_world = _place(body, triangle, sample, np.zeros((len(triangle), 3), np.float32))
+    return Contact("colliding" if has_witness else "", points_world, triangle)
 
 
-def _place(body: Body, hits: Hits, positions: NDArray[Real]) -> NDArray[Real]:
+def _place(
+    body: Body,
+    triangle: NDArray[np.uint32],
+    sample: NDArray[np.uint32],
+    positions: NDArray[Real],
+) -> NDArray[Real]:
     mesh = body.triangles
     return hit_positions(
-        mesh.vertices_world, mesh.faces, mesh.viewports, hits.triangle, hits.sample, positions
+        mesh.vertices_world, mesh.faces, mesh.viewports, triangle, sample, positions
     )
 
 

@@ -143,11 +143,14 @@ class Compute:
         keys.sort()
         cuts = np.searchsorted(keys, starts.astype(np.uint64) << np.uint64(32))
         return [
-            Hits(
+            Hits.from_samples(
+                mesh.topology,
                 ((keys[cut:next_cut] >> np.uint64(32)) - np.uint64(start)).astype(np.uint32),
                 keys[cut:next_cut].astype(np.uint32),  # the low half
             )
-            for cut, next_cut, start in zip(cuts[:-1], cuts[1:], starts[:-1], strict=True)
+            for mesh, cut, next_cut, start in zip(
+                meshes, cuts[:-1], cuts[1:], starts[:-1], strict=True
+            )
         ]
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ the CPU), ``compute`` (OpenGL 4.3 compute) and ``stencil`` (the paper's multi-pa
 return the same samples, except those that project within 1e-3 px of a pixel edge.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
@@ -13,9 +13,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.viewport import MAX_VIEWPORT
+from hybridve.hull.query.viewport import MAX_VIEWPORT, expand_runs, samples_before
 
 EngineName = Literal["auto", "compute", "native", "reference"]
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class Topology:
+    """What of a mesh stays the same when its vertices move.
+
+    Attributes
+    ----------
+    faces : (T, 3) int32
+        Vertex numbers.
+    viewports : (T,) int32
+        Samples along an edge of each triangle.
+    samples_before : (T + 1,) int64
+        How many samples all triangles before each have: samples are numbered through the mesh.
+    """
+
+    faces: NDArray[np.int32]
+    viewports: NDArray[np.int32]
+    samples_before: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.faces)
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -23,9 +45,11 @@ class Triangles:
     """A triangle mesh in the world, with the viewport of each triangle.
 
     Engines keep what they derive from it (uploads, bounds) for as long as the object lives, so
-    pass the same object for every frame in which the mesh does not move. Its arrays are private
-    copies that cannot be written to; an array that is read-only already is taken as it is, so
-    ``dataclasses.replace(triangles, vertices_world=...)`` moves a mesh without copying the rest.
+    pass the same object for every frame in which the mesh does not move, and `moved` gives the
+    one to pass where it does: what does not depend on the vertices is kept then, too. Neighbours
+    should stand next to each other (`hybridve.hull.query.clusters.spatial_order`): engines ask
+    runs of consecutive triangles together. The arrays are private copies that cannot be written
+    to; an array that is read-only already is taken as it is.
 
     Attributes
     ----------
@@ -35,6 +59,8 @@ class Triangles:
         Vertex numbers.
     viewports : (T,) int32
         Samples along an edge of each triangle; see `hybridve.hull.query.viewport`.
+    topology : Topology
+        The last two and what follows from them; one object for all that `moved` returns.
 
     Raises
     ------
@@ -46,19 +72,14 @@ class Triangles:
     vertices_world: NDArray[np.float64]
     faces: NDArray[np.int32]
     viewports: NDArray[np.int32]
+    topology: Topology = field(init=False)
 
     def __post_init__(self) -> None:
-        vertices_world = _private(self.vertices_world, np.float64, (3,), "vertices_world")
+        vertices_world = _checked_vertices(self.vertices_world)
         faces = _private(self.faces, np.int32, (3,), "faces")
         viewports = _private(self.viewports, np.int32, (), "viewports")
         if len(viewports) != len(faces):
             raise ValueError(f"{len(viewports)} viewports for {len(faces)} triangles")
-        # A sum is finite only where every summand is: one pass over millions of coordinates.
-        with np.errstate(over="ignore", invalid="ignore"):
-            total = vertices_world.sum()
-        if not np.isfinite(total) and not np.isfinite(vertices_world).all():
-            vertex = int(np.flatnonzero(~np.isfinite(vertices_world).all(axis=1))[0])
-            raise ValueError(f"vertex {vertex} is not finite: {vertices_world[vertex]}")
         if len(faces):
             if faces.min() < 0 or faces.max() >= len(vertices_world):
                 face = int(
@@ -77,6 +98,27 @@ class Triangles:
         object.__setattr__(self, "vertices_world", vertices_world)
         object.__setattr__(self, "faces", faces)
         object.__setattr__(self, "viewports", viewports)
+        topology = Topology(faces, viewports, samples_before(viewports))
+        object.__setattr__(self, "topology", topology)
+
+    def moved(self, vertices_world: NDArray[np.float64]) -> "Triangles":
+        """Return the same triangles with their vertices elsewhere: (V, 3) metres, world.
+
+        Raises
+        ------
+        ValueError
+            If there is another number of vertices, or a coordinate is not finite.
+        """
+        if np.shape(vertices_world) != self.vertices_world.shape:
+            raise ValueError(
+                f"vertices_world has shape {np.shape(vertices_world)}, "
+                f"expected {self.vertices_world.shape}"
+            )
+        moved = object.__new__(Triangles)
+        object.__setattr__(moved, "vertices_world", _checked_vertices(vertices_world))
+        for name in ("faces", "viewports", "topology"):
+            object.__setattr__(moved, name, getattr(self, name))
+        return moved
 
     def __len__(self) -> int:
         return len(self.faces)
@@ -85,6 +127,17 @@ class Triangles:
     def corners_world(self) -> NDArray[np.float64]:
         """The vertices a, b, c of each triangle, (T, 3, 3) metres."""
         return self.vertices_world[self.faces]
+
+
+def _checked_vertices(given: NDArray[Any]) -> NDArray[np.float64]:
+    vertices_world = _private(given, np.float64, (3,), "vertices_world")
+    # A sum is finite only where every summand is: one pass over millions of coordinates.
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = vertices_world.sum()
+    if not np.isfinite(total) and not np.isfinite(vertices_world).all():
+        vertex = int(np.flatnonzero(~np.isfinite(vertices_world).all(axis=1))[0])
+        raise ValueError(f"vertex {vertex} is not finite: {vertices_world[vertex]}")
+    return vertices_world
 
 
 def _private(
@@ -106,21 +159,48 @@ def _private(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """The samples inside the hull, sorted by triangle, then sample.
+    """The samples of a mesh that are inside the hull, as runs of consecutive samples.
+
+    Samples are numbered through the mesh: sample s of triangle t is number
+    ``topology.samples_before[t] + s``. Where the hull swallows whole triangles, or the whole mesh,
+    one run says so, and nobody waits for millions of numbers that he may not want.
 
     Attributes
     ----------
-    triangle : (P,) uint32
-        Number of the triangle in its mesh.
-    sample : (P,) uint32
-        Number of the sample in the triangle's viewport.
+    topology : Topology
+        Of the mesh.
+    start, stop : (R,) int64
+        The first sample of each run, and the one after its last; runs are ascending, not empty,
+        and do not overlap. Where one ends, the next may begin.
     """
 
-    triangle: NDArray[np.uint32]
-    sample: NDArray[np.uint32]
+    topology: Topology
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+
+    @classmethod
+    def from_samples(
+        cls, topology: Topology, triangle: NDArray[np.uint32], sample: NDArray[np.uint32]
+    ) -> Self:
+        """Return hits from (P,) triangles and sample numbers in their viewports, ascending."""
+        number = topology.samples_before[triangle] + sample
+        is_first = np.diff(number, prepend=-2) != 1
+        start = number[is_first]
+        stop = number[np.append(is_first[1:], True)[: len(number)]] + 1
+        return cls(topology, start, stop)
 
     def __len__(self) -> int:
-        return len(self.triangle)
+        return int((self.stop - self.start).sum())
+
+    def samples(self, most: int | None = None) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+        """Return triangle and number in its viewport of each sample, (P,) and (P,), ascending.
+
+        With `most`, only of the first so many.
+        """
+        count = len(self) if most is None else min(most, len(self))
+        triangle, sample = np.zeros(count, np.uint32), np.zeros(count, np.uint32)
+        expand_runs(self.start, self.stop, self.topology.samples_before, triangle, sample)
+        return triangle, sample
 
 
 class Engine(Protocol):

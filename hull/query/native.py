@@ -652,7 +652,9 @@ class Native:
         result: list[list[tuple[NDArray[np.uint32], NDArray[np.uint32]]]] = [[] for _ in meshes]
         for (number, _), part in zip(shares, parts, strict=True):
             result[number].append(part)
-        return [_joined(parts_of_mesh) for parts_of_mesh in result]
+        return [
+            _joined(mesh, parts_of_mesh) for mesh, parts_of_mesh in zip(meshes, result, strict=True)
+        ]
 
     def close(self) -> None:
         """End the threads; a later query starts them again."""
@@ -723,8 +725,7 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-def _joined(parts: list[tuple[NDArray[np.uint32], NDArray[np.uint32]]]) -> Hits:
-    if not parts:
-        return Hits(np.zeros(0, np.uint32), np.zeros(0, np.uint32))
-    triangles, samples = zip(*parts, strict=True)
-    return Hits(np.concatenate(triangles), np.concatenate(samples))
+def _joined(mesh: Triangles, parts: list[tuple[NDArray[np.uint32], NDArray[np.uint32]]]) -> Hits:
+    none = np.zeros(0, np.uint32)
+    triangles, samples = zip((none, none), *parts, strict=True)
+    return Hits.from_samples(mesh.topology, np.concatenate(triangles), np.concatenate(samples))

@@ -103,20 +103,19 @@ class Reference:
 
 def _query_mesh(hull: Hull, mesh: Triangles) -> Hits:
     """Ask the samples of a mesh in their order, a chunk at a time."""
-    viewports = mesh.viewports.astype(np.int64)
-    ends = np.cumsum(viewports * (viewports + 1) // 2)  # samples up to and with each triangle
+    before = mesh.topology.samples_before
     vertices_local = mesh.vertices_world - hull.views.origin_world
     triangles: list[NDArray[np.uint32]] = [np.zeros(0, np.uint32)]
     samples: list[NDArray[np.uint32]] = [np.zeros(0, np.uint32)]
-    total = int(ends[-1]) if len(ends) else 0
+    total = int(before[-1])
     for start in range(0, total, _CHUNK):
         number = np.arange(start, min(start + _CHUNK, total))
-        triangle = np.searchsorted(ends, number, side="right")
-        sample = (number - (ends - viewports * (viewports + 1) // 2)[triangle]).astype(np.uint32)
+        triangle = np.searchsorted(before, number, side="right") - 1
+        sample = (number - before[triangle]).astype(np.uint32)
         positions_local = sample_positions(
             vertices_local[mesh.faces[triangle]], mesh.viewports[triangle], sample
         )
         inside = _contains(hull, positions_local)
         triangles.append(triangle[inside].astype(np.uint32))
         samples.append(sample[inside])
-    return Hits(np.concatenate(triangles), np.concatenate(samples))
+    return Hits.from_samples(mesh.topology, np.concatenate(triangles), np.concatenate(samples))

@@ -32,6 +32,16 @@ def n_samples(viewport: int) -> int:
     return viewport * (viewport + 1) // 2
 
 
+def samples_before(viewports: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return how many samples the triangles before each of T triangles have: (T + 1,)."""
+    counts = viewports.astype(np.int64)
+    counts *= counts + 1
+    counts >>= 1
+    before = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    before.flags.writeable = False
+    return before
+
+
 def sample_steps(
     viewports: NDArray[np.int32], samples: NDArray[np.uint32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -184,3 +194,48 @@ def _fill_positions(
             positions[hit, axis] = (
                 start + (vertices[b, axis] - start) * along + (vertices[c, axis] - start) * up
             )
+
+
+@compiled
+def expand_runs(
+    start: NDArray[np.int64],
+    stop: NDArray[np.int64],
+    before: NDArray[np.int64],
+    triangle: NDArray[np.uint32],
+    sample: NDArray[np.uint32],
+) -> None:
+    """Write triangle and number in its viewport of the samples of runs, as many as there is room.
+
+    Parameters
+    ----------
+    start, stop : (R,) int64
+        Runs of samples, numbered through the mesh, ascending.
+    before : (T + 1,) int64
+        Samples of the triangles before each; see `samples_before`.
+    triangle, sample : (P,) uint32
+        What is written.
+    """
+    n, t = 0, 0
+    for run in range(len(start)):
+        number = start[run]
+        if number >= before[t + 1]:  # on to the triangle of this sample, by bisection
+            low, high = t + 1, len(before) - 1
+            while high - low > 1:
+                middle = (low + high) // 2
+                if before[middle] <= number:
+                    low = middle
+                else:
+                    high = middle
+            t = low
+        while number < stop[run]:
+            end = min(stop[run], before[t + 1])
+            first = before[t]
+            for k in range(min(end - number, len(triangle) - n)):
+                triangle[n] = t
+                sample[n] = number - first + k
+                n += 1
+            if n == len(triangle):
+                return
+            number = end
+            if number == before[t + 1]:
+                t += 1

@@ -42,7 +42,7 @@ def bench_static_mesh(benchmark: Any, engine: Engine, hulls: list[Hull], n_trian
     frames = iter(range(1 << 30))
 
     (hits,) = engine.query(hulls[0], [mesh])
-    colliding = len(np.unique(hits.triangle)) / len(mesh)
+    colliding = len(np.unique(hits.samples()[0])) / len(mesh)
     assert 0.01 < colliding < 0.03
     benchmark.extra_info.update(
         triangles=len(mesh), colliding=colliding, hits=len(hits), renderer=engine.renderer

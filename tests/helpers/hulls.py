@@ -301,8 +301,7 @@ def differences(
     views: Views, mesh: Triangles, first: Hits, second: Hits, band_px: float
 ) -> Difference:
     """Compare the samples of two engines."""
-    keys = [hits.triangle.astype(np.int64) << 32 | hits.sample for hits in (first, second)]
-    only_one = np.setxor1d(*keys)
+    only_one = np.setxor1d(keys(first), keys(second))
     triangle, sample = only_one >> 32, (only_one & 0xFFFFFFFF).astype(np.uint32)
     corners_local = (mesh.vertices_world - views.origin_world)[mesh.faces[triangle]]
     positions = sample_positions(corners_local, mesh.viewports[triangle], sample)
@@ -312,8 +311,20 @@ def differences(
 
 
 def is_in_order(mesh: Triangles, hits: Hits) -> bool:
-    """Tell whether hits are sorted by triangle, then sample, without repeats, and in range."""
-    keys = hits.triangle.astype(np.int64) << 32 | hits.sample
-    viewports = mesh.viewports[hits.triangle].astype(np.int64)
-    in_range = hits.sample < viewports * (viewports + 1) // 2
-    return bool((np.diff(keys) > 0).all() and in_range.all())
+    """Tell whether runs ascend, are not empty, do not overlap, and hold samples of the mesh."""
+    triangle, sample = hits.samples()
+    viewports = mesh.viewports[triangle].astype(np.int64)
+    in_range = (sample < viewports * (viewports + 1) // 2).all()
+    ascend = (hits.start < hits.stop).all() and (hits.stop[:-1] <= hits.start[1:]).all()
+    return bool(in_range and ascend and (np.diff(keys(hits)) > 0).all())
+
+
+def keys(hits: Hits) -> NDArray[np.int64]:
+    """Return one number for each sample, (P,): ``triangle << 32 | sample``."""
+    triangle, sample = hits.samples()
+    return triangle.astype(np.int64) << 32 | sample
+
+
+def assert_same_samples(first: Hits, second: Hits) -> None:
+    """Fail where two engines' samples differ at all."""
+    np.testing.assert_array_equal(keys(first), keys(second))

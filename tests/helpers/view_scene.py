@@ -76,12 +76,13 @@ def touched_box(
     viewports = np.full(len(plain.faces), 24, np.int32)
     with Reference() as engine:
         hits = engine.query(hull, [Triangles(plain.vertices_world, plain.faces, viewports)])[0]
-    corners = plain.vertices_world[plain.faces[hits.triangle]]
-    points = sample_positions(corners, viewports[hits.triangle], hits.sample)
+    triangle, sample = hits.samples()
+    corners = plain.vertices_world[plain.faces[triangle]]
+    points = sample_positions(corners, viewports[triangle], sample)
     return replace(
         plain,
         collides=len(hits) > 0,
-        hit_triangles=np.unique(hits.triangle),
+        hit_triangles=np.unique(triangle),
         hit_points_world=points.astype(np.float32),
     )
 
