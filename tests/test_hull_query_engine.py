@@ -1,14 +1,14 @@
 """Meshes as engines take them, and which engine serves."""
 
-import dataclasses
-
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query import compute as compute_module
 from hybridve.hull.query.choose import open_engine
-from hybridve.hull.query.engine import Triangles
+from hybridve.hull.query.engine import Hits, Triangles
 
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -64,14 +64,55 @@ def test_a_mesh_does_not_change_with_the_arrays_it_was_made_from() -> None:
         mesh.vertices_world[0] = 1.0
 
 
-def test_a_moved_mesh_shares_its_faces() -> None:
+def test_a_moved_mesh_shares_all_but_its_vertices() -> None:
     mesh = Triangles(VERTICES, FACES, VIEWPORTS)
+    vertices = VERTICES + 1.0
 
-    moved = dataclasses.replace(mesh, vertices_world=VERTICES + 1.0)
+    moved = mesh.moved(vertices)
+    vertices[:] = 7.0
 
+    assert moved.topology is mesh.topology
     assert moved.faces is mesh.faces
     assert moved.viewports is mesh.viewports
     np.testing.assert_array_equal(moved.corners_world, mesh.corners_world + 1.0)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "message"),
+    [
+        (VERTICES[:3], r"shape \(3, 3\), expected \(4, 3\)"),
+        (np.where(VERTICES == 1, np.inf, VERTICES), r"vertex 1 is not finite"),
+    ],
+)
+def test_a_mesh_is_not_moved_to_nowhere(vertices: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Triangles(VERTICES, FACES, VIEWPORTS).moved(vertices)
+
+
+@given(
+    viewports=st.lists(st.integers(1, 12), min_size=1, max_size=30),
+    share=st.floats(0, 1),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_runs_hold_the_samples_they_were_made_of(
+    viewports: list[int], share: float, seed: int
+) -> None:
+    n_triangles = len(viewports)
+    faces = np.zeros((n_triangles, 3), np.int32)
+    mesh = Triangles(np.zeros((1, 3)), faces, np.array(viewports, np.int32))
+    every = [(t, s) for t, u in enumerate(viewports) for s in range(u * (u + 1) // 2)]
+    some = np.random.default_rng(seed).random(len(every)) < share
+    expected = [sample for sample, is_in in zip(every, some, strict=True) if is_in]
+    triangle, sample = np.array(expected, np.uint32).reshape(-1, 2).T
+
+    hits = Hits.from_samples(mesh.topology, triangle, sample)
+
+    assert len(hits) == len(expected)
+    numbers = [n for a, b in zip(hits.start, hits.stop, strict=True) for n in range(a, b)]
+    assert numbers == np.flatnonzero(some).tolist()
+    assert (hits.start[1:] > hits.stop[:-1]).all()  # as few runs as can be
+    for most in (None, 0, 3):
+        assert list(zip(*(a.tolist() for a in hits.samples(most)), strict=True)) == expected[:most]
 
 
 @pytest.mark.parametrize(

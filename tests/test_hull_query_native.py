@@ -1,5 +1,7 @@
 """The compiled engine: its rejection, its threads, its grids of samples."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from helpers.hulls import (
@@ -14,32 +16,46 @@ from helpers.hulls import (
 )
 
 from hybridve.hull.query import native as native_module
-from hybridve.hull.query.bounds import FREE, verdicts
+from hybridve.hull.query.bounds import FREE, OPEN, verdicts
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference
 from hybridve.hull.query.silhouettes import make_hull
 
 
-def test_only_what_rectangles_leave_open_is_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("n_queries", [1, 2], ids=["triangles", "clusters"])
+def test_only_what_rectangles_leave_open_is_sampled(
+    monkeypatch: pytest.MonkeyPatch, n_queries: int
+) -> None:
     views = ring_views()
     hull = ball_hull(views, np.array([0.5, 0.0, 0.0]), 0.13)
     mesh = sphere_mesh(3000)
-    left = verdicts(hull, mesh.corners_world - views.origin_world) != FREE
+    verdict = verdicts(hull, mesh.corners_world - views.origin_world)
+    asked: list[int] = []
     kept: list[int] = []
-    compiled = native_module._triangle_verdicts
+    compiled = native_module.batch_verdicts
 
-    def spy(*arguments: object) -> int:
+    def spy(*arguments: Any) -> int:
         n_left = compiled(*arguments)
-        kept.extend(arguments[-2][:n_left].tolist())
+        asked.extend(range(arguments[0], arguments[0] + arguments[1]))
+        kept.extend(arguments[-3][:n_left].tolist())
         return n_left
 
+    engine = Native(1)
+    for _ in range(n_queries - 1):
+        engine.query(hull, [mesh])
     # Run the compiled loop's source, so that it can be listened to.
-    monkeypatch.setattr(native_module, "_triangle_verdicts", spy)
-    monkeypatch.setattr(native_module, "_query_range", native_module._query_range.py_func)
-    Native(1).query(hull, [mesh])
+    monkeypatch.setattr(native_module, "batch_verdicts", spy)
+    monkeypatch.setattr(native_module, "_query", native_module._query.py_func)
+    engine.query(hull, [mesh])
 
-    assert kept == np.flatnonzero(left).tolist()
+    is_asked = np.isin(np.arange(len(mesh)), asked)
+    assert kept == np.flatnonzero(is_asked & (verdict != FREE)).tolist()
+    if n_queries == 1:
+        assert is_asked.all()
+    else:  # clusters are asked first; some are proved free, or inside, as a whole
+        assert is_asked[verdict == OPEN].all()
+        assert is_asked.mean() < 0.3
 
 
 @pytest.mark.parametrize("viewport", [1, 2, 7, 8, 9, 16, 17, 63, 64, 65, 129, 200])
@@ -86,7 +102,7 @@ def test_an_error_in_a_thread_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*arguments: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(native_module, "_query_range", fail)
+    monkeypatch.setattr(native_module, "_query", fail)
     monkeypatch.setattr(native_module, "_SHARE_TRIANGLES", 10)
     hull = ball_hull(ring_views(), np.zeros(3), 0.2)
 

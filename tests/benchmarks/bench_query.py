@@ -12,7 +12,7 @@ import pytest
 from helpers.hulls import ball_hull, ring_views, sphere_mesh
 
 from hybridve.hull.query.choose import open_engine
-from hybridve.hull.query.engine import Engine, Triangles
+from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
 #: A ball on the rim of a sphere meets 2 % of its triangles (asserted below).
@@ -59,8 +59,7 @@ def bench_moving_mesh(benchmark: Any, engine: Engine, hulls: list[Hull], n_trian
     benchmark.extra_info.update(triangles=len(mesh), renderer=engine.renderer)
 
     def query() -> None:
-        moved = Triangles(mesh.vertices_world + 0.0, mesh.faces, mesh.viewports)
-        engine.query(hulls[0], [moved])
+        engine.query(hulls[0], [mesh.moved(mesh.vertices_world + 0.0)])
 
     benchmark(query)
 

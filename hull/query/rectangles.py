@@ -1,0 +1,360 @@
+"""What rectangles prove, compiled: of triangles in batches, and of clusters of triangles.
+
+The argument is that of `hybridve.hull.query.bounds`. Here it is asked of a whole mesh. Triangles
+that stand next to each other in the mesh form clusters of `CLUSTER`, clusters groups of `BRANCH`,
+and so on up. What a cluster projects into is kept for each camera as long as neither mesh nor
+cameras move, so that in each new frame four look-ups tell what a camera proves of all its
+triangles. `hybridve.hull.query.clusters` makes them, and puts neighbours next to each other.
+
+Named tuples carry what many loops need. Reading an array from one counts a reference, some
+nanoseconds: the innermost functions take the arrays themselves.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.hull.jit import compiled
+
+#: What one camera's rectangle proves: no sample inside, all on object pixels, none seen, nothing.
+REJECTS, ACCEPTS, ABSTAINS, UNDECIDED = 0, 1, 2, 3
+
+#: Triangles whose rectangles are computed together: their corners stay in the first cache.
+BATCH = 256
+
+#: Triangles of a cluster, and clusters (or groups) of a group.
+CLUSTER, BRANCH = 32, 4
+
+
+class Frame(NamedTuple):
+    """The hull of one frame as compiled loops take it, cameras in the order they are asked.
+
+    Attributes
+    ----------
+    matrices : (C, 12) float64
+        Projections in pixels from metres, local frame, row-major.
+    sizes : (C, 2) int64
+        Width and height.
+    masks, mask_offset, integrals, integral_offset
+        As in `hybridve.hull.query.silhouettes.Hull`.
+    keep : bool
+        Whether a camera that cannot see a point abstains.
+    min_cameras : int
+        How many must see it then.
+    """
+
+    matrices: NDArray[np.float64]
+    sizes: NDArray[np.int64]
+    masks: NDArray[np.uint8]
+    mask_offset: NDArray[np.int64]
+    integrals: NDArray[np.int32]
+    integral_offset: NDArray[np.int64]
+    keep: bool
+    min_cameras: int
+
+
+class Surface(NamedTuple):
+    """A mesh as compiled loops take it.
+
+    Attributes
+    ----------
+    vertices_local : (V, 3) float64
+        Metres.
+    faces : (T, 3) int32
+        Vertex numbers.
+    pads : (C, 3) float64
+        See `hybridve.hull.query.bounds.rectangle_pads`; cameras as in the frame.
+    """
+
+    vertices_local: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    pads: NDArray[np.float64]
+
+
+class Tree(NamedTuple):
+    """The clusters of a mesh, groups of them, groups of groups.
+
+    Attributes
+    ----------
+    rectangles : (N, C, 4) int32
+        The pixels first_x, last_x, first_y, last_y that each node projects into, clamped to
+        -1..size; cameras in the order of the views. Level after level, clusters first.
+    level_start : (L + 1,) int64
+        Where each level starts in `rectangles`.
+    order : (C,) int64
+        The cameras in the order of the frame.
+    """
+
+    rectangles: NDArray[np.int32]
+    level_start: NDArray[np.int64]
+    order: NDArray[np.int64]
+
+
+@compiled
+def rectangle_vote(
+    first_x: int,
+    last_x: int,
+    first_y: int,
+    last_y: int,
+    width: int,
+    height: int,
+    first: int,
+    integrals: NDArray[np.int32],
+    keep: bool,
+) -> int:
+    """Return what a rectangle of pixels, clamped to -1..size, proves in one camera.
+
+    Its image is width x height pixels, its integral image begins at `first`.
+    """
+    x0, x1 = max(first_x, 0), min(last_x + 1, width)
+    y0, y1 = max(first_y, 0), min(last_y + 1, height)
+    if x1 <= x0 or y1 <= y0:
+        return ABSTAINS if keep else REJECTS
+    wholly_seen = first_x >= 0 and first_y >= 0 and last_x < width and last_y < height
+    above, below = first + y0 * (width + 1), first + y1 * (width + 1)
+    count = (
+        integrals[below + x1]
+        - integrals[above + x1]
+        - integrals[below + x0]
+        + integrals[above + x0]
+    )
+    if count == 0 and (wholly_seen or not keep):
+        return REJECTS
+    if wholly_seen and count == (x1 - x0) * (y1 - y0):
+        return ACCEPTS
+    return UNDECIDED
+
+
+@compiled
+def triangle_rectangles(
+    n_triangles: int,
+    corners: NDArray[np.float64],
+    m: NDArray[np.float64],
+    width_px: int,
+    height_px: int,
+    pads: NDArray[np.float64],
+    rectangles: NDArray[np.int32],
+) -> None:
+    """Write the pixels first_x, last_x, first_y, last_y that triangles project into: (4, n).
+
+    One camera: its projection m (12,), its pads (3,).
+
+    Free of branches, and corners (9, n) lie coordinate after coordinate, so that the compiler
+    takes several triangles in one instruction.
+    """
+    m0, m1, m2, m3, m4, m5 = m[0], m[1], m[2], m[3], m[4], m[5]
+    m6, m7, m8, m9, m10, m11 = m[6], m[7], m[8], m[9], m[10], m[11]
+    pad_x, pad_y, near_m = pads[0], pads[1], pads[2]
+    width, height = float(width_px), float(height_px)
+    for i in range(n_triangles):
+        x, y, z = corners[0, i], corners[1, i], corners[2, i]
+        depth_a = m8 * x + m9 * y + m10 * z + m11
+        x_a = (m0 * x + m1 * y + m2 * z + m3) / depth_a
+        y_a = (m4 * x + m5 * y + m6 * z + m7) / depth_a
+        x, y, z = corners[3, i], corners[4, i], corners[5, i]
+        depth_b = m8 * x + m9 * y + m10 * z + m11
+        x_b = (m0 * x + m1 * y + m2 * z + m3) / depth_b
+        y_b = (m4 * x + m5 * y + m6 * z + m7) / depth_b
+        x, y, z = corners[6, i], corners[7, i], corners[8, i]
+        depth_c = m8 * x + m9 * y + m10 * z + m11
+        x_c = (m0 * x + m1 * y + m2 * z + m3) / depth_c
+        y_c = (m4 * x + m5 * y + m6 * z + m7) / depth_c
+
+        depth_min_m = min(depth_a, min(depth_b, depth_c))
+        depth_max_m = max(depth_a, max(depth_b, depth_c))
+        in_front, behind = depth_min_m >= near_m, depth_max_m <= -near_m
+        # Where a corner is not in front its pixel means nothing: the whole image, or none of it.
+        low_x = min(x_a, min(x_b, x_c)) - pad_x / depth_min_m if in_front else -1.0
+        high_x = max(x_a, max(x_b, x_c)) + pad_x / depth_min_m if in_front else width
+        low_y = min(y_a, min(y_b, y_c)) - pad_y / depth_min_m if in_front else -1.0
+        high_y = max(y_a, max(y_b, y_c)) + pad_y / depth_min_m if in_front else height
+        high_x = -1.0 if behind else high_x
+        rectangles[0, i] = np.int32(np.floor(min(max(low_x, -1.0), width)))
+        rectangles[1, i] = np.int32(np.floor(min(max(high_x, -1.0), width)))
+        rectangles[2, i] = np.int32(np.floor(min(max(low_y, -1.0), height)))
+        rectangles[3, i] = np.int32(np.floor(min(max(high_y, -1.0), height)))
+
+
+@compiled
+def load_corners(
+    start: int,
+    n_triangles: int,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    corners: NDArray[np.float64],
+) -> None:
+    """Write the corners of consecutive triangles, coordinate after coordinate: (9, n)."""
+    for i in range(n_triangles):
+        for k in range(3):
+            vertex = faces[start + i, k]
+            corners[3 * k, i] = vertices[vertex, 0]
+            corners[3 * k + 1, i] = vertices[vertex, 1]
+            corners[3 * k + 2, i] = vertices[vertex, 2]
+
+
+@compiled
+def cluster_rectangles(
+    first: int, last: int, surface: Surface, frame: Frame, rectangles: NDArray[np.int32]
+) -> None:
+    """Write the rectangles (clusters, C, 4) of clusters first..last: the union of their triangles'.
+
+    A union proves what its parts prove together: where a part's rectangle is the whole plane, so
+    is the union; a part behind the camera has none, and only makes the union look cut off by the
+    border.
+    """
+    corners = np.zeros((9, CLUSTER))
+    parts = np.zeros((4, CLUSTER), np.int32)
+    for cluster in range(first, last):
+        start = cluster * CLUSTER
+        n_triangles = min(CLUSTER, len(surface.faces) - start)
+        load_corners(start, n_triangles, surface.vertices_local, surface.faces, corners)
+        for camera in range(len(frame.matrices)):
+            triangle_rectangles(
+                n_triangles,
+                corners,
+                frame.matrices[camera],
+                frame.sizes[camera, 0],
+                frame.sizes[camera, 1],
+                surface.pads[camera],
+                parts,
+            )
+            x0, x1, y0, y1 = parts[0, 0], parts[1, 0], parts[2, 0], parts[3, 0]
+            for i in range(1, n_triangles):
+                x0, x1 = min(x0, parts[0, i]), max(x1, parts[1, i])
+                y0, y1 = min(y0, parts[2, i]), max(y1, parts[3, i])
+            rectangles[cluster, camera, 0] = x0
+            rectangles[cluster, camera, 1] = x1
+            rectangles[cluster, camera, 2] = y0
+            rectangles[cluster, camera, 3] = y1
+
+
+@compiled
+def node_verdict(
+    rectangles: NDArray[np.int32],
+    order: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    integrals: NDArray[np.int32],
+    integral_offset: NDArray[np.int64],
+    keep: bool,
+    min_cameras: int,
+    cameras: NDArray[np.int64],
+    n_cameras: int,
+    n_accept: int,
+    left: NDArray[np.int64],
+) -> tuple[int, int, bool]:
+    """Ask some cameras about a node of a tree, whose rectangles are (C, 4) in the tree's order.
+
+    Returns
+    -------
+    n_left : int
+        How many cameras stay undecided; they are left in `left`, in order.
+    n_accept : int
+        How many, with those before, see nothing but object pixels.
+    is_free : bool
+        Whether no sample of the node can be inside.
+    """
+    n_left = 0
+    for number in range(n_cameras):
+        camera = cameras[number]
+        place = order[camera]
+        vote = rectangle_vote(
+            rectangles[place, 0],
+            rectangles[place, 1],
+            rectangles[place, 2],
+            rectangles[place, 3],
+            sizes[camera, 0],
+            sizes[camera, 1],
+            integral_offset[camera],
+            integrals,
+            keep,
+        )
+        if vote == REJECTS:
+            return 0, 0, True
+        if vote == ACCEPTS:
+            n_accept += 1
+        elif vote == UNDECIDED:
+            left[n_left] = camera
+            n_left += 1
+    return n_left, n_accept, keep and n_accept + n_left < min_cameras
+
+
+@compiled
+def batch_verdicts(
+    start: int,
+    n_triangles: int,
+    surface: Surface,
+    frame: Frame,
+    cameras: NDArray[np.int64],
+    n_cameras: int,
+    n_accept: int,
+    corners: NDArray[np.float64],
+    rectangles: NDArray[np.int32],
+    triangle: NDArray[np.int64],
+    accepted: NDArray[np.int64],
+    is_open: NDArray[np.bool_],
+) -> int:
+    """Ask some cameras, one after the other, about consecutive triangles; return how many are left.
+
+    Parameters
+    ----------
+    cameras, n_cameras, n_accept
+        Whom to ask, and how many others see nothing but object pixels.
+    corners, rectangles
+        Room to work in, (9, n) and (4, n).
+    triangle : (n,) int64
+        Written: the triangles that are not proved free, ascending.
+    accepted : (n,) int64
+        Written: how many cameras see nothing but object pixels of each.
+    is_open : (n, C) bool
+        Written: which cameras are undecided about it. None: all its samples are inside.
+    """
+    load_corners(start, n_triangles, surface.vertices_local, surface.faces, corners)
+    integrals, keep = frame.integrals, frame.keep
+    all_cameras = len(frame.matrices)
+    for i in range(n_triangles):
+        triangle[i], accepted[i] = start + i, n_accept
+    n_left = n_triangles
+    for number in range(n_cameras):
+        camera = cameras[number]
+        width, height = frame.sizes[camera, 0], frame.sizes[camera, 1]
+        first = frame.integral_offset[camera]
+        triangle_rectangles(
+            n_left, corners, frame.matrices[camera], width, height, surface.pads[camera], rectangles
+        )
+        n_kept = 0
+        n_later = n_cameras - number - 1
+        for i in range(n_left):
+            vote = rectangle_vote(
+                rectangles[0, i],
+                rectangles[1, i],
+                rectangles[2, i],
+                rectangles[3, i],
+                width,
+                height,
+                first,
+                integrals,
+                keep,
+            )
+            if vote == REJECTS:
+                continue
+            n_accepted = accepted[i] + (vote == ACCEPTS)
+            for other in range(all_cameras):
+                is_open[n_kept, other] = number > 0 and is_open[i, other]
+            is_open[n_kept, camera] = vote == UNDECIDED
+            if keep:
+                n_open = 0
+                for other in range(all_cameras):
+                    n_open += is_open[n_kept, other]
+                if n_accepted + n_open + n_later < frame.min_cameras:
+                    continue
+            triangle[n_kept], accepted[n_kept] = triangle[i], n_accepted
+            for k in range(9):
+                corners[k, n_kept] = corners[k, i]
+            n_kept += 1
+        n_left = n_kept
+    if n_cameras == 0:
+        for i in range(n_triangles):
+            for other in range(all_cameras):
+                is_open[i, other] = False
+    return n_left
