@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from helpers.hulls import (
     EDGE_BAND_PX,
+    MASK_KINDS,
+    TRIANGLE_KINDS,
     assert_same_samples,
     ball_hull,
     differences,
@@ -15,6 +17,9 @@ from helpers.hulls import (
     look_at,
     near_pixel_edge,
     projection,
+    random_corners,
+    random_masks,
+    random_views,
     ring_views,
     soup,
     sphere_mesh,
@@ -23,12 +28,13 @@ from helpers.hulls import (
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query import compute as compute_module
 from hybridve.hull.query import device as device_module
-from hybridve.hull.query.bounds import FREE, verdicts
+from hybridve.hull.query.bounds import OPEN, verdicts
 from hybridve.hull.query.compute import Compute
 from hybridve.hull.query.device import open_device
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.native import Native
-from hybridve.hull.query.silhouettes import Views, make_hull, make_views
+from hybridve.hull.query.reference import Reference
+from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull, make_views
 from hybridve.hull.query.viewport import sample_positions
 
 pytestmark = pytest.mark.gl
@@ -61,6 +67,24 @@ def large_views(rng: np.random.Generator) -> Views:
         pose = look_at(center, np.zeros(3), rng.uniform(0, 6.0))
         matrices.append(projection(pose, focal_px, 1600, 1200))
     return make_views(tuple("abcd"), np.array([[1600, 1200]] * 4), np.array(matrices))
+
+
+def counters(engine: Compute) -> tuple[int, int]:
+    """Return how many clusters and blocks the first mesh of the last query left open."""
+    read = np.frombuffer(engine._counters.read(), np.uint32)
+    return int(read[3]), int(read[7])
+
+
+def random_scene(seed: int, n_triangles: int, n_cameras: int = 4) -> tuple[Hull, Triangles]:
+    """Every kind of silhouette and triangle in no order, so that clusters are large and mixed."""
+    rng = np.random.default_rng(seed)
+    unseen: Unseen = "keep" if seed % 2 else "carve"
+    views = random_views(rng, n_cameras, unseen, min_cameras=1 + seed % n_cameras)
+    kinds = rng.choice(MASK_KINDS, n_cameras).tolist()
+    hull = make_hull(views, random_masks(rng, views, kinds))
+    corners = [random_corners(rng, views, kind) for kind in rng.choice(TRIANGLE_KINDS, n_triangles)]
+    viewports = rng.choice([1, 2, 7, 10, 32, 33, 64, 65], n_triangles).astype(np.int32)
+    return hull, soup(views, np.array(corners), viewports)
 
 
 # The largest triangles span the image and more: float32 about a vertex would not do for them.
@@ -128,13 +152,181 @@ def test_only_what_rectangles_leave_open_is_sampled(compute: Compute) -> None:
     views = ring_views()
     hull = ball_hull(views, np.array([0.5, 0.0, 0.0]), 0.13)
     mesh = sphere_mesh(20_000)
-    n_open = int((verdicts(hull, mesh.corners_world - views.origin_world) != FREE).sum())
+    n_open = int((verdicts(hull, mesh.corners_world - views.origin_world) == OPEN).sum())
 
     compute.query(hull, [mesh])
 
-    n_items = int(np.frombuffer(compute._counters.read(), np.uint32)[3])
+    n_open_clusters, n_items = counters(compute)
+    assert 0 < n_open_clusters < 0.1 * len(mesh) / compute_module._CLUSTER
     assert n_open <= n_items
     assert n_items - n_open <= 0.01 * n_open  # what the wider pad of single precision costs
+
+
+@pytest.mark.parametrize("unseen", ["carve", "keep"])
+@pytest.mark.parametrize("n_triangles", [1, 63, 64, 65, 400, 5000])
+def test_a_mesh_wholly_inside_is_one_run(
+    compute: Compute, n_triangles: int, unseen: Unseen
+) -> None:
+    """Neither its triangles are asked one by one, nor its samples counted out."""
+    hull = ball_hull(ring_views(unseen=unseen), np.zeros(3), 0.4)
+    inside = sphere_mesh(5000, 0.2, viewport=100)
+    mesh = Triangles(
+        inside.vertices_world, inside.faces[:n_triangles], inside.viewports[:n_triangles]
+    )
+
+    (hits,) = compute.query(hull, [mesh])
+
+    assert counters(compute) == (0, 0)
+    assert hits.start.tolist() == [0]
+    assert hits.stop.tolist() == [len(mesh) * 5050]
+
+
+def test_a_mesh_beyond_the_hull_is_dropped_by_the_cluster(compute: Compute) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+
+    (hits,) = compute.query(hull, [sphere_mesh(5000, 0.1, center_world=(0.4, 0.0, 0.0))])
+
+    assert counters(compute) == (0, 0)
+    assert len(hits) == 0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_rectangles_only_save_work(compute: Compute, context: moderngl.Context, seed: int) -> None:
+    hull, mesh = random_scene(seed, 150, n_cameras=(2, 4, 9, 20)[seed % 4])
+
+    (with_rectangles,) = compute.query(hull, [mesh])
+    with Compute(context, reject=False) as engine:
+        (without,) = engine.query(hull, [mesh])
+        n_open_clusters, _ = counters(engine)
+
+    assert n_open_clusters == 3  # all of them
+    assert is_in_order(mesh, with_rectangles)
+    assert_same_samples(with_rectangles, without)
+
+
+@pytest.mark.parametrize("n_triangles", [1, 7, 8, 9, 63, 64, 65, 127, 129, 500])
+def test_the_size_of_clusters_does_not_matter(
+    compute: Compute, context: moderngl.Context, monkeypatch: pytest.MonkeyPatch, n_triangles: int
+) -> None:
+    """In particular where it does not divide the number of triangles."""
+    hull = ball_hull(ring_views(), np.array([0.3, 0.0, 0.0]), 0.25)
+    whole = sphere_mesh(500, 0.3)
+    viewports = np.random.default_rng(0).integers(1, 70, len(whole)).astype(np.int32)
+    first = Triangles(whole.vertices_world, whole.faces[-n_triangles:], viewports[-n_triangles:])
+
+    (found,) = compute.query(hull, [first])
+    monkeypatch.setattr(compute_module, "_CLUSTER", compute._group_size)
+    with Compute(context) as engine:
+        (found_small,) = engine.query(hull, [first])
+
+    (expected,) = Reference().query(hull, [first])
+    assert differences(hull.views, first, found, expected, EDGE_BAND_PX).outside_band == []
+    assert_same_samples(found, found_small)
+    assert n_triangles < 500 or len(found) > 0
+
+
+def test_boxes_hold_their_clusters_and_no_more(compute: Compute) -> None:
+    views = ring_views()
+    rng = np.random.default_rng(3)
+    n_triangles = 3 * compute_module._CLUSTER + 5
+    corners = rng.normal(size=(n_triangles, 3, 3))
+    mesh = soup(views, corners, np.full(n_triangles, 2, np.int32))
+
+    compute.query(ball_hull(views, np.zeros(3), 0.2), [mesh])
+
+    boxes = np.frombuffer(compute._placements[mesh].boxes.read(), np.float32).reshape(2, 3, 4)
+    rounded = (mesh.corners_world - views.origin_world).astype(np.float32)
+    for cluster in range(4):
+        own = rounded[compute_module._CLUSTER * cluster :][: compute_module._CLUSTER]
+        np.testing.assert_array_equal(boxes[0, :, cluster], own.min(axis=(0, 1)))
+        np.testing.assert_array_equal(boxes[1, :, cluster], own.max(axis=(0, 1)))
+
+
+@pytest.mark.parametrize("unseen", ["carve", "keep"])
+def test_clusters_on_both_sides_of_a_camera_are_asked(compute: Compute, unseen: Unseen) -> None:
+    """Camera 0 stands within the boxes of clusters whose triangles the others see."""
+    views = ring_views(4, 160, 120, 150.0, unseen=unseen, min_cameras=2)
+    full = [np.ones((120, 160), np.uint8)] * 4
+    matrix = views.img_from_local[0]
+    camera_world = views.origin_world - np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    rng = np.random.default_rng(5)
+    # Between twice the camera's place and the middle, and beside it.
+    corners = (
+        camera_world * rng.uniform(-0.2, 2.0, (300, 1, 1)) + rng.normal(size=(300, 3, 3)) * 0.2
+    )
+    mesh = soup(views, corners - views.origin_world, np.full(300, 12, np.int32))
+    hull = make_hull(views, full)
+
+    (found,), (expected,) = compute.query(hull, [mesh]), Reference().query(hull, [mesh])
+
+    assert differences(views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+    assert len(found) > 1000
+
+
+def test_a_mesh_that_moves_is_asked_where_it_is(compute: Compute) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    first = mesh = sphere_mesh(700, 0.15, viewport=6)
+    counts = set()
+    for k in range(8):
+        mesh = first.moved(first.vertices_world * (1 - 0.05 * k) + np.array([0.06 * k, 0.0, 0.0]))
+        fresh = Triangles(mesh.vertices_world, mesh.faces, mesh.viewports)
+
+        # The first stays alive, the others come and go; now and then two of them at a time.
+        found, found_first, found_fresh = compute.query(hull, [mesh, first, fresh])
+        (again,) = compute.query(hull, [mesh])
+
+        (expected,) = Reference().query(hull, [mesh])
+        assert differences(hull.views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+        assert_same_samples(found, found_fresh)
+        assert_same_samples(found, again)
+        assert_same_samples(found_first, compute.query(hull, [first])[0])
+        counts.add(len(found))
+    assert len(counts) > 4, "it would not show where an earlier place was asked"
+
+
+def test_other_cameras_see_a_mesh_about_their_own_origin(compute: Compute) -> None:
+    mesh = sphere_mesh(300, 0.2, viewport=5)
+    here = ring_views()
+    shift = np.array([0.5, -0.25, 1.0])
+    matrices = here.img_from_local.copy()
+    matrices[:, :, 3] += matrices[:, :, :3] @ shift
+    there = Views(here.names, here.sizes_px, matrices, here.origin_world + shift)
+    for views in (here, there, here):
+        hull = ball_hull(views, np.array([0.1, 0.0, 0.0]), 0.2)
+
+        (found,), (expected,) = compute.query(hull, [mesh]), native.query(hull, [mesh])
+
+        assert differences(views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+        assert len(found) > 0
+
+
+def test_only_the_vertices_of_a_mesh_that_moves_are_sent_again(compute: Compute) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    mesh = sphere_mesh(700, 0.15)
+    compute.query(hull, [mesh])
+    surface, placement = compute._surfaces[mesh.topology], compute._placements[mesh]
+    mesh = mesh.moved(mesh.vertices_world + 0.01)
+
+    compute.query(hull, [mesh])
+
+    assert compute._surfaces[mesh.topology] is surface
+    assert compute._placements[mesh].vertices_world is placement.vertices_world
+    assert compute._placements[mesh].boxes is placement.boxes
+    assert len(surface.placements) == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_meshes_with_viewports_of_every_size_are_sampled_alike(compute: Compute, seed: int) -> None:
+    scenes = [random_scene(seed, n) for n in (200, 130)]
+    hull = scenes[0][0]
+    meshes = [mesh for _, mesh in scenes]
+
+    found, expected = compute.query(hull, meshes), Reference().query(hull, meshes)
+
+    for mesh, hits, expected_hits in zip(meshes, found, expected, strict=True):
+        assert is_in_order(mesh, hits)
+        assert differences(hull.views, mesh, hits, expected_hits, EDGE_BAND_PX).outside_band == []
+    assert sum(map(len, found)) > 100
 
 
 def test_meshes_are_told_apart(compute: Compute) -> None:
@@ -187,24 +379,23 @@ def test_a_frame_too_large_for_the_device_is_asked_in_parts(context: moderngl.Co
 def test_a_triangle_too_large_for_the_device_is_named(context: moderngl.Context) -> None:
     hull = ball_hull(ring_views(), np.zeros(3), 0.2)
     mesh = Triangles(
-        np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]),
+        np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0]]),
         np.array([[0, 1, 2]], np.int32),
-        np.array([100], np.int32),
+        np.array([1000], np.int32),
     )
     with Compute(context) as engine:
-        hull_fits = engine.query(hull, [mesh])
-        engine._largest = 1 << 12
+        (fits,) = engine.query(hull, [mesh])
+        engine._largest = 1 << 14
         engine._hits = engine._reserve(64)
-        with pytest.raises(DeviceError, match=r"triangle 0 has 5050 samples .* native"):
+        with pytest.raises(DeviceError, match=r"triangle 0 has \d+ runs of samples .* native"):
             engine.query(hull, [mesh])
-    assert len(hull_fits[0]) == 5050
+    assert 0 < len(fits) < 1000 * 1001 // 2  # were all of it inside, one run would say so
 
 
 def test_samples_that_32_bits_cannot_count_are_asked_in_batches() -> None:
     before = np.cumsum([0, *[3 << 29] * 3, 1 << 28, 1 << 28, 1 << 28])
-    uploaded = [type("Uploaded", (), {"samples_before": before})()] * 2
 
-    batches = compute_module._batches(uploaded, [range(6), range(6)])
+    batches = compute_module._batches([before, before])
 
     samples = [sum(int(before[x.stop] - before[x.start]) for x in batch) for batch in batches]
     assert max(samples) <= 1 << 31
@@ -220,7 +411,8 @@ def test_what_belonged_to_a_mesh_leaves_the_device_with_it(compute: Compute) -> 
 
     compute.query(hull, [kept])
 
-    assert list(compute._meshes) == [kept]
+    assert list(compute._placements) == [kept]
+    assert list(compute._surfaces) == [kept.topology]
 
 
 def test_the_same_engine_serves_other_cameras(compute: Compute) -> None:
@@ -252,8 +444,18 @@ def test_a_driver_that_does_not_compile_the_shaders_is_named(
     broken = "#version 430 core\nlayout(local_size_x = 1) in; void main() { nothing(); }"
     monkeypatch.setattr(device_module, "load_shader", lambda name: broken)
 
-    with pytest.raises(DeviceError, match=r"does not compile volume_reject.*nothing.*native"):
+    with pytest.raises(DeviceError, match=r"does not compile volume_cluster.*nothing.*native"):
         compute.programs_for(4)
+
+
+def test_engines_with_devices_of_their_own_take_turns() -> None:
+    hull = ball_hull(ring_views(), np.array([0.1, 0.0, 0.0]), 0.2)
+    meshes = [sphere_mesh(100 * k, 0.2, viewport=5) for k in range(1, 4)]
+    with Compute() as first, Compute() as second:
+        for mesh in meshes:
+            (of_first,), (of_second,) = first.query(hull, [mesh]), second.query(hull, [mesh])
+            assert_same_samples(of_first, of_second)
+            assert len(of_first) > 0
 
 
 def test_closing_twice_is_harmless(context: moderngl.Context) -> None:

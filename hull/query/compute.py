@@ -1,10 +1,19 @@
 """The volume query in OpenGL 4.3 compute shaders.
 
-Two passes for each mesh, with nothing read back in between: ``volume_reject.comp.glsl`` keeps the
-triangles that the rectangles of `hybridve.hull.query.bounds` do not prove free, and
-``volume_sample.comp.glsl`` samples only these. All meshes of a frame append to one buffer of hits,
-and only the hits are read back. What does not change from frame to frame (meshes, cameras) stays
-on the device.
+Three passes for each mesh, with nothing read back in between. ``volume_cluster.comp.glsl`` asks
+the box around each cluster, a run of consecutive triangles; ``volume_reject.comp.glsl`` asks the
+triangles of the clusters that stay open; ``volume_sample.comp.glsl`` samples the triangles that
+stay open. In the first two the rectangles of `hybridve.hull.query.bounds` decide, so that the work
+follows the surface near the hull and not the size of the mesh. All meshes of a frame append to one
+buffer of hits, and only the hits are read back. A hit is four numbers:
+
+    triangle, first sample, how many samples, mesh       a run of samples of one triangle
+    triangle, WHOLE, how many triangles, mesh            all samples of a run of triangles
+
+What does not change from frame to frame (meshes, cameras) stays on the device. Of a mesh that
+moves, only the vertices are sent again, into the buffers of the vertices they replace;
+``volume_round.comp.glsl`` and ``volume_bounds.comp.glsl`` then compute there what the passes need
+of them.
 
 Buffers for survivors and hits grow when a frame overflows them, and the frame is asked again.
 Buffers are dropped, never released by name: moderngl queues what Python drops, and ``gc()``
@@ -29,20 +38,31 @@ from hybridve.hull.query.device import (
     open_device,
     renderer_name,
 )
-from hybridve.hull.query.engine import Hits, Triangles
+from hybridve.hull.query.engine import Hits, Topology, Triangles
 from hybridve.hull.query.silhouettes import Hull, Views
 
-#: Edge in samples of the blocks that the second pass takes: BLOCK in the shaders.
+#: Triangles of a cluster: CLUSTER in the shaders, a multiple of their GROUP.
+_CLUSTER = 64
+#: Edge in samples of the blocks that the last pass takes: BLOCK in the shaders, where the rows of
+#: a block are the bits of a word.
 _BLOCK = 32
 #: Invocations of a work group: GROUP in the shaders. Mesa's software renderer takes 8 in one
 #: instruction, and switching between several such packs at a barrier costs it more than the work.
 _GROUP_SIZE, _SOFTWARE_GROUP_SIZE = 64, 8
-#: Work groups that every device takes in one dispatch; more are strided over.
-_MAX_GROUPS = 65_535
+#: Work groups of one dispatch; more are strided over. Every device takes 65535. To start one costs
+#: Mesa's software renderer some 70 ns, as much as a few lines of shader.
+_MAX_GROUPS, _SOFTWARE_MAX_GROUPS = 65_535, 4096
 #: Samples of one batch of launches: their counters are 32-bit.
 _MAX_SAMPLES = 1 << 31
 #: Bytes that the buffers of survivors and of hits begin with.
 _FIRST_SIZE = 1 << 19
+#: What stands for the first sample where all are meant: WHOLE in the shaders.
+_WHOLE = 0xFFFFFFFF
+#: Bytes of an item, and of a hit.
+_ITEM_SIZE, _HIT_SIZE = 8, 16
+#: Counters of a launch: the groups of the second pass (x, y, z) and its clusters, the groups of
+#: the third and its items. One more at the end counts the hits of all launches.
+_LAUNCH_COUNTERS = np.array([0, 1, 1, 0, 0, 1, 1, 0], np.uint32)
 
 #: One camera, as `struct Camera` in rectangle.glsl lays it out.
 _CAMERA = np.dtype(
@@ -62,21 +82,46 @@ class _Cameras:
 
     views: Views
     buffer: moderngl.Buffer
+    pad_rows: moderngl.Buffer
     precise: moderngl.Buffer
     mask_words: NDArray[np.int64]  # where each camera's mask starts, in camera order
     n_mask_words: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Mesh:
-    """What is on the device as long as a mesh and the cameras stay the same."""
+class _Placement:
+    """The vertices of a mesh on the device, and what follows from them."""
 
+    mesh: weakref.ref[Triangles]
     views: Views
+    vertices_world: moderngl.Buffer
     vertices_local: moderngl.Buffer
+    boxes: moderngl.Buffer
+
+
+@dataclass(slots=True, eq=False)
+class _Surface:
+    """What is on the device of all meshes that differ in nothing but their vertices.
+
+    `spare` are the placements of meshes that are gone: the next vertices go into their buffers.
+    """
+
     faces: moderngl.Buffer
     viewports: moderngl.Buffer
-    pads: moderngl.Buffer
-    samples_before: NDArray[np.int64]  # (T + 1,) samples of all triangles before each
+    n_triangles: int
+    placements: list[_Placement]
+    spare: list[_Placement]
+
+    @property
+    def n_clusters(self) -> int:
+        return -(-self.n_triangles // _CLUSTER)
+
+    def find_spare(self) -> None:
+        """Note which meshes are gone; spares that were not taken up since are dropped."""
+        self.spare = [placement for placement in self.placements if placement.mesh() is None]
+        self.placements = [
+            placement for placement in self.placements if placement.mesh() is not None
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +133,15 @@ class _Launch:
     stop: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Programs:
+    """The passes, compiled with room for some number of cameras."""
+
+    cluster: moderngl.ComputeShader
+    reject: moderngl.ComputeShader
+    sample: moderngl.ComputeShader
+
+
 class Compute:
     """The volume query on an OpenGL device.
 
@@ -97,6 +151,8 @@ class Compute:
     ----------
     context : moderngl.Context, optional
         An OpenGL 4.3 context that the caller releases; by default the engine opens its own.
+    reject : bool
+        Whether rectangles decide before samples are taken. The result is the same without.
 
     Raises
     ------
@@ -106,51 +162,53 @@ class Compute:
 
     name = "compute"
 
-    def __init__(self, context: moderngl.Context | None = None) -> None:
+    def __init__(self, context: moderngl.Context | None = None, *, reject: bool = True) -> None:
         self._is_closed = False
         self._owns_context = context is None
         self._context = open_device() if context is None else context
         self.renderer = renderer_name(self._context)
         self._largest = int(self._context.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
-        self._group_size = (
-            _SOFTWARE_GROUP_SIZE if is_software_renderer(self.renderer) else _GROUP_SIZE
-        )
-        self._programs: dict[int, tuple[moderngl.ComputeShader, moderngl.ComputeShader]] = {}
+        is_software = is_software_renderer(self.renderer)
+        self._group_size = _SOFTWARE_GROUP_SIZE if is_software else _GROUP_SIZE
+        self._max_groups = _SOFTWARE_MAX_GROUPS if is_software else _MAX_GROUPS
+        self._reject = reject
+        self._programs: dict[int, _Programs] = {}
+        self._placing: tuple[moderngl.ComputeShader, moderngl.ComputeShader] | None = None
         self._cameras: _Cameras | None = None
         self._hull: Hull | None = None
-        self._meshes: weakref.WeakKeyDictionary[Triangles, _Mesh] = weakref.WeakKeyDictionary()
+        self._surfaces: weakref.WeakKeyDictionary[Topology, _Surface] = weakref.WeakKeyDictionary()
+        self._placements: weakref.WeakKeyDictionary[Triangles, _Placement] = (
+            weakref.WeakKeyDictionary()
+        )
         self._order = self._reserve(4)
         self._masks = self._reserve(4)
         self._integrals = self._reserve(4)
+        self._open_clusters = self._reserve(4)
         self._items = self._reserve(_FIRST_SIZE)
         self._hits = self._reserve(_FIRST_SIZE)
         self._counters = self._reserve(4)
 
     def query(self, hull: Hull, meshes: list[Triangles]) -> list[Hits]:
         """Return for each mesh its samples inside the hull of this frame."""
+        self._make_current()
+        for surface in self._surfaces.values():
+            surface.find_spare()
         self._context.gc()  # what belonged to meshes that are gone
         if hull is not self._hull:
             self._upload_hull(hull)
-        uploaded = [self._upload_mesh(hull.views, mesh) for mesh in meshes]
-        # Triangles of all meshes are numbered through, so that one sort puts all hits in order.
-        starts = np.concatenate([[0], np.cumsum([len(mesh) for mesh in meshes])]).astype(np.int64)
-        if starts[-1] >= 1 << 32:
-            raise ValueError(f"{starts[-1]} triangles, expected fewer than 2^32")
-        batches = [
-            self._run(hull.views, uploaded, starts, batch) for batch in _batches(uploaded, meshes)
-        ]
-        keys = np.concatenate([np.zeros(0, np.uint64), *batches])
-        keys.sort()
-        cuts = np.searchsorted(keys, starts.astype(np.uint64) << np.uint64(32))
+        for mesh in meshes:
+            self._place(hull.views, mesh)
+        batches = _batches([mesh.topology.samples_before for mesh in meshes])
+        hits = np.concatenate(
+            [np.zeros((0, 4), np.uint32), *(self._run(hull.views, meshes, b) for b in batches)]
+        )
+        if len(meshes) == 1:
+            return [_runs(meshes[0].topology, hits)]
+        hits = hits[np.argsort(hits[:, 3], kind="stable")]
+        cuts = np.searchsorted(hits[:, 3], np.arange(len(meshes) + 1))
         return [
-            Hits.from_samples(
-                mesh.topology,
-                ((keys[cut:next_cut] >> np.uint64(32)) - np.uint64(start)).astype(np.uint32),
-                keys[cut:next_cut].astype(np.uint32),  # the low half
-            )
-            for mesh, cut, next_cut, start in zip(
-                meshes, cuts[:-1], cuts[1:], starts[:-1], strict=True
-            )
+            _runs(mesh.topology, hits[cut:next_cut])
+            for mesh, cut, next_cut in zip(meshes, cuts[:-1], cuts[1:], strict=True)
         ]
 
     def close(self) -> None:
@@ -158,11 +216,13 @@ class Compute:
         if self._is_closed:
             return
         self._is_closed = True
-        self._meshes.clear()
+        self._make_current()
+        self._surfaces.clear()
+        self._placements.clear()
         self._programs.clear()
-        self._cameras, self._hull = None, None
+        self._placing, self._cameras, self._hull = None, None, None
         del self._order, self._masks, self._integrals
-        del self._items, self._hits, self._counters
+        del self._open_clusters, self._items, self._hits, self._counters
         self._context.gc()
         if self._owns_context:
             self._context.release()
@@ -178,6 +238,15 @@ class Compute:
     ) -> None:
         self.close()
 
+    def _make_current(self) -> None:
+        """Take the thread's OpenGL commands; another engine may have had them since.
+
+        Not left again at the end: through EGL, that would leave none current, and so break who
+        does not ask.
+        """
+        context: Any = self._context  # whose stub leaves its methods of this kind untyped
+        context.__enter__()
+
     def _reserve(self, size: int) -> moderngl.Buffer:
         return self._context.buffer(reserve=size, dynamic=True)
 
@@ -191,8 +260,8 @@ class Compute:
             return self._reserve(4)
         return self._context.buffer(np.ascontiguousarray(array))
 
-    def programs_for(self, n_cameras: int) -> tuple[moderngl.ComputeShader, moderngl.ComputeShader]:
-        """Return both passes, compiled with room for `n_cameras` in shared memory.
+    def programs_for(self, n_cameras: int) -> _Programs:
+        """Return the passes, compiled with room for `n_cameras` in shared memory.
 
         A query does so by itself; asked beforehand, it tells whether the driver compiles them.
 
@@ -201,21 +270,32 @@ class Compute:
         DeviceError
             If the driver does not.
         """
+        self._make_current()
         room = _room(n_cameras)
         if room not in self._programs:
-            constants = (
-                f"#define BLOCK {_BLOCK}u\n#define N_CAMERAS {room}\n"
-                f"#define GROUP {self._group_size}\n"
-            )
-            rectangle = load_shader("rectangle.glsl")
-            self._programs[room] = (
-                compile_compute(self._context, "volume_reject.comp.glsl", constants, rectangle),
-                compile_compute(self._context, "volume_sample.comp.glsl", constants, rectangle),
+            rectangle = f"#define N_CAMERAS {room}\n" + load_shader("rectangle.glsl")
+            self._programs[room] = _Programs(
+                self._compile("volume_cluster.comp.glsl", rectangle),
+                self._compile("volume_reject.comp.glsl", rectangle),
+                self._compile("volume_sample.comp.glsl", rectangle),
             )
         return self._programs[room]
 
+    def _compile(self, name: str, *parts: str) -> moderngl.ComputeShader:
+        constants = (
+            f"#define BLOCK {_BLOCK}u\n#define CLUSTER {_CLUSTER}u\n"
+            f"#define GROUP {self._group_size}u\n#define WHOLE {_WHOLE}u\n"
+            f"#define MAX_GROUPS {self._max_groups}u\n#define REJECT {int(self._reject)}\n"
+        )
+        return compile_compute(self._context, name, constants, *parts)
+
     def _upload_hull(self, hull: Hull) -> None:
-        """Put the silhouettes of a frame on the device, masks as one bit a pixel."""
+        """Put the silhouettes of a frame on the device, masks as one bit a pixel.
+
+        The integral images are sent as they are. Of four images of 720 x 486 this takes 0.4 ms on
+        a software renderer, and cv2 computed them in 0.25 ms; to sum them up there, in one pass
+        over the rows and one over the columns, takes 6.4 ms.
+        """
         views = hull.views
         # The camera that sees the smallest silhouette rejects most: ask it first.
         ends = hull.integral_offset + (views.sizes_px + 1).prod(axis=1) - 1
@@ -248,10 +328,14 @@ class Compute:
         used["width"], used["height"] = views.sizes_px.T
         used["first_mask_word"] = mask_words[:-1]
         used["first_integral"] = hull.integral_offset
+        pad_rows = np.zeros((_room(len(views)), 2, 4), np.float32)
+        pad_rows[: len(views)] = _pad_rows(views)
+        precise = np.concatenate([views.origin_world, views.img_from_local.reshape(-1)])
         return _Cameras(
             views,
             self._upload(table.view(np.uint8), "the cameras"),
-            self._upload(views.img_from_local, "the cameras"),
+            self._upload(pad_rows, "the cameras"),
+            self._upload(precise, "the cameras"),
             mask_words[:-1],
             int(mask_words[-1]),
         )
@@ -263,49 +347,93 @@ class Compute:
         buffer.write(np.ascontiguousarray(array))
         return buffer
 
-    def _upload_mesh(self, views: Views, mesh: Triangles) -> _Mesh:
-        uploaded = self._meshes.get(mesh)
-        if uploaded is None or uploaded.views is not views:
-            vertices_local = mesh.vertices_world - views.origin_world
-            reach_m = np.abs(vertices_local).max(axis=0, initial=0.0)
-            pads = np.zeros((_room(len(views)), 4), np.float32)
-            pads[: len(views), :3] = rectangle_pads(views, reach_m, ROUNDOFF_FLOAT32)
-            n_samples = mesh.viewports.astype(np.int64)
-            n_samples = n_samples * (n_samples + 1) // 2
-            uploaded = _Mesh(
-                views,
-                self._upload(vertices_local, f"a mesh of {len(vertices_local)} vertices"),
-                self._upload(mesh.faces, f"a mesh of {len(mesh)} triangles"),
-                self._upload(mesh.viewports, f"a mesh of {len(mesh)} triangles"),
-                self._upload(pads, "the cameras"),
-                np.concatenate([[0], np.cumsum(n_samples)]).astype(np.int64),
+    def _place(self, views: Views, mesh: Triangles) -> None:
+        """Put a mesh on the device, as far as it is not there."""
+        topology = mesh.topology
+        surface = self._surfaces.get(topology)
+        if surface is None:
+            what = f"a mesh of {len(mesh)} triangles"
+            surface = _Surface(
+                self._upload(topology.faces, what),
+                self._upload(topology.viewports, what),
+                len(topology),
+                [],
+                [],
             )
-            self._meshes[mesh] = uploaded
-        return uploaded
+            self._surfaces[topology] = surface
+        placement = self._placements.get(mesh)
+        if placement is None or placement.views is not views:
+            if placement is not None:
+                surface.placements.remove(placement)
+                surface.spare.append(placement)
+            placement = self._place_vertices(views, mesh, surface)
+            self._placements[mesh] = placement
+            surface.placements.append(placement)
+
+    def _place_vertices(self, views: Views, mesh: Triangles, surface: _Surface) -> _Placement:
+        """Send the vertices of a mesh; round them, and bound its clusters, on the device."""
+        vertices = mesh.vertices_world
+        what = f"a mesh of {len(vertices)} vertices"
+        if surface.spare:  # of the same sizes, since the topology is the same
+            spare = surface.spare.pop()
+            placement = _Placement(
+                weakref.ref(mesh),
+                views,
+                self._rewrite(spare.vertices_world, vertices, what),
+                spare.vertices_local,
+                spare.boxes,
+            )
+        else:
+            placement = _Placement(
+                weakref.ref(mesh),
+                views,
+                self._upload(vertices, what),
+                self._reserve(max(4, 12 * len(vertices))),
+                self._reserve(max(4, 24 * surface.n_clusters)),
+            )
+        if surface.n_triangles == 0:
+            return placement
+        assert self._cameras is not None
+        if self._placing is None:
+            self._placing = (
+                self._compile("volume_round.comp.glsl"),
+                self._compile("volume_bounds.comp.glsl"),
+            )
+        round_vertices, bound = self._placing
+        placement.boxes.bind_to_storage_buffer(1)
+        placement.vertices_world.bind_to_storage_buffer(3)
+        surface.faces.bind_to_storage_buffer(4)
+        self._cameras.precise.bind_to_storage_buffer(10)
+        placement.vertices_local.bind_to_storage_buffer(11)
+        _set(round_vertices, n_coordinates=vertices.size)
+        _set(bound, n_triangles=surface.n_triangles, n_clusters=surface.n_clusters)
+        round_vertices.run(min(-(-vertices.size // self._group_size), self._max_groups))
+        self._context.memory_barrier(self._context.SHADER_STORAGE_BARRIER_BIT)
+        bound.run(min(surface.n_clusters, self._max_groups))
+        self._context.memory_barrier(self._context.SHADER_STORAGE_BARRIER_BIT)
+        return placement
 
     def _run(
-        self,
-        views: Views,
-        meshes: list[_Mesh],
-        starts: NDArray[np.int64],
-        launches: list[_Launch],
-    ) -> NDArray[np.uint64]:
-        """Return the hits of some launches, unordered, each ``triangle << 32 | sample``."""
+        self, views: Views, meshes: list[Triangles], launches: list[_Launch]
+    ) -> NDArray[np.uint32]:
+        """Return the hits of some launches, (N, 4), unordered; see above what they say."""
         while True:
-            n_items, n_hits = self._dispatch(views, meshes, starts, launches)
-            if 8 * n_items <= self._items.size and 8 * n_hits <= self._hits.size:
-                return np.frombuffer(self._hits.read(8 * n_hits), "<u8") if n_hits else _NO_HITS
-            if 8 * max(n_items, n_hits) > self._largest:
+            n_items, n_hits = self._dispatch(views, meshes, launches)
+            needed_items, needed_hits = _ITEM_SIZE * n_items, _HIT_SIZE * n_hits
+            if needed_items <= self._items.size and needed_hits <= self._hits.size:
+                read = self._hits.read(needed_hits) if n_hits else b""
+                return np.frombuffer(read, np.uint32).reshape(-1, 4)
+            if max(needed_items, needed_hits) > self._largest:
                 halves = _halved(launches)
                 if halves is None:
                     raise DeviceError(
-                        f"triangle {launches[0].start} has {n_hits} samples in the hull, more than "
-                        f"{self.renderer} holds in one buffer; take a smaller viewport, or "
-                        "--engine native"
+                        f"triangle {launches[0].start} has {n_hits} runs of samples in the hull, "
+                        f"more than {self.renderer} holds in one buffer; take a smaller viewport, "
+                        "or --engine native"
                     )
-                return np.concatenate([self._run(views, meshes, starts, half) for half in halves])
-            self._items = self._grown(self._items, 8 * n_items)
-            self._hits = self._grown(self._hits, 8 * n_hits)
+                return np.concatenate([self._run(views, meshes, half) for half in halves])
+            self._items = self._grown(self._items, needed_items)
+            self._hits = self._grown(self._hits, needed_hits)
 
     def _grown(self, buffer: moderngl.Buffer, needed: int) -> moderngl.Buffer:
         if needed <= buffer.size:
@@ -313,65 +441,102 @@ class Compute:
         return self._reserve(min(self._largest, 1 << (needed - 1).bit_length()))
 
     def _dispatch(
-        self,
-        views: Views,
-        meshes: list[_Mesh],
-        starts: NDArray[np.int64],
-        launches: list[_Launch],
+        self, views: Views, meshes: list[Triangles], launches: list[_Launch]
     ) -> tuple[int, int]:
-        """Run both passes of some launches; return how many items and hits they have."""
+        """Run the passes of some launches; return how many items and hits they have."""
         assert self._cameras is not None
-        reject, sample = self.programs_for(len(views))
-        # Four counters a launch: the groups of its second pass (x, y, z), and its items. One more:
-        # the hits of all.
-        counters = np.zeros(4 * len(launches) + 1, np.uint32)
-        counters[1:-1:4] = counters[2:-1:4] = 1
+        programs = self.programs_for(len(views))
+        counters = np.append(np.tile(_LAUNCH_COUNTERS, len(launches)), np.uint32(0))
         self._counters = self._rewrite(self._counters, counters, "the counters")
+        most_clusters = max((x.stop - x.start for x in launches), default=0) // _CLUSTER + 2
+        self._open_clusters = self._grown(self._open_clusters, 4 * most_clusters)
         self._cameras.buffer.bind_to_uniform_block(0)
+        self._cameras.pad_rows.bind_to_uniform_block(1)
         self._order.bind_to_uniform_block(2)
         self._integrals.bind_to_storage_buffer(0)
+        self._open_clusters.bind_to_storage_buffer(2)
         self._items.bind_to_storage_buffer(6)
         self._counters.bind_to_storage_buffer(7)
         self._hits.bind_to_storage_buffer(8)
         self._masks.bind_to_storage_buffer(9)
         self._cameras.precise.bind_to_storage_buffer(10)
-        for program in (reject, sample):
+        for program in (programs.cluster, programs.reject, programs.sample):
             _set(
                 program,
                 n_cameras=len(views),
                 keep=int(views.unseen == "keep"),
                 min_cameras=views.min_cameras,
-                item_capacity=self._items.size // 8,
-                hit_capacity=self._hits.size // 8,
-                hit_counter=4 * len(launches),
+                item_capacity=self._items.size // _ITEM_SIZE,
+                hit_capacity=self._hits.size // _HIT_SIZE,
+                hit_counter=len(counters) - 1,
             )
+        barrier = self._context.SHADER_STORAGE_BARRIER_BIT
         for number, launch in enumerate(launches):
             mesh = meshes[launch.mesh]
-            mesh.pads.bind_to_uniform_block(1)
-            mesh.vertices_local.bind_to_storage_buffer(3)
-            mesh.faces.bind_to_storage_buffer(4)
-            mesh.viewports.bind_to_storage_buffer(5)
-            _set(reject, first_triangle=launch.start, stop_triangle=launch.stop, launch=number)
-            _set(sample, launch=number, triangle_number=int(starts[launch.mesh]))
-            n_groups = -(-(launch.stop - launch.start) // self._group_size)
-            reject.run(min(n_groups, _MAX_GROUPS))
-            self._context.memory_barrier(
-                self._context.SHADER_STORAGE_BARRIER_BIT | self._context.COMMAND_BARRIER_BIT
+            surface, placement = self._surfaces[mesh.topology], self._placements[mesh]
+            placement.boxes.bind_to_storage_buffer(1)
+            placement.vertices_world.bind_to_storage_buffer(3)
+            surface.faces.bind_to_storage_buffer(4)
+            surface.viewports.bind_to_storage_buffer(5)
+            placement.vertices_local.bind_to_storage_buffer(11)
+            _set(
+                programs.cluster,
+                first_triangle=launch.start,
+                stop_triangle=launch.stop,
+                n_clusters=surface.n_clusters,
+                launch=number,
+                mesh=launch.mesh,
             )
-            sample.run_indirect(self._counters, 16 * number)
-            self._context.memory_barrier(
-                self._context.SHADER_STORAGE_BARRIER_BIT | self._context.BUFFER_UPDATE_BARRIER_BIT
+            _set(
+                programs.reject,
+                first_triangle=launch.start,
+                stop_triangle=launch.stop,
+                launch=number,
+                mesh=launch.mesh,
             )
+            _set(programs.sample, launch=number, mesh=launch.mesh)
+            n_clusters = -(-launch.stop // _CLUSTER) - launch.start // _CLUSTER
+            programs.cluster.run(min(-(-n_clusters // self._group_size), self._max_groups))
+            self._context.memory_barrier(barrier | self._context.COMMAND_BARRIER_BIT)
+            start = number * _LAUNCH_COUNTERS.nbytes
+            programs.reject.run_indirect(self._counters, start)
+            self._context.memory_barrier(barrier | self._context.COMMAND_BARRIER_BIT)
+            programs.sample.run_indirect(self._counters, start + _LAUNCH_COUNTERS.nbytes // 2)
+            self._context.memory_barrier(barrier | self._context.BUFFER_UPDATE_BARRIER_BIT)
         counters = np.frombuffer(self._counters.read(), np.uint32)
-        return int(counters[3:-1:4].max(initial=0)), int(counters[-1])
+        return int(counters[7:-1:8].max(initial=0)), int(counters[-1])
+
+
+def _pad_rows(views: Views) -> NDArray[np.float64]:
+    """Return the pads in x and y of a set by its reach, (C, 2, 4): see rectangle.glsl.
+
+    They are linear in the reach: what each axis adds, and what is there without any.
+    """
+    reaches_m = np.concatenate([np.eye(3), np.zeros((1, 3))])
+    pads = rectangle_pads(views, reaches_m, ROUNDOFF_FLOAT32)[..., :2]  # (4, C, 2)
+    pads[:3] -= pads[3]
+    rows: NDArray[np.float64] = pads.transpose(1, 2, 0)
+    return rows
+
+
+def _runs(topology: Topology, hits: NDArray[np.uint32]) -> Hits:
+    """Return what the device found of one mesh, in order."""
+    before = topology.samples_before
+    triangle, first, count, _ = hits.T.astype(np.int64)
+    is_whole = first == _WHOLE
+    start = before[triangle] + np.where(is_whole, 0, first)
+    stop = np.where(is_whole, before[np.where(is_whole, triangle + count, 0)], start + count)
+    # Runs do not overlap: in whatever order they come, the n-th start belongs to the n-th stop.
+    start.sort()
+    stop.sort()
+    is_apart = np.ones(len(hits) + 1, np.bool_)  # before each run, and after the last
+    is_apart[1:-1] = start[1:] != stop[:-1]
+    return Hits(topology, start[is_apart[:-1]], stop[is_apart[1:]])
 
 
 def _room(n_cameras: int) -> int:
     """Return for how many cameras the programs that serve `n_cameras` are compiled."""
     return 1 << max(3, (n_cameras - 1).bit_length())
-
-
-_NO_HITS = np.zeros(0, np.uint64)
 
 
 def _set(program: moderngl.ComputeShader, **values: int) -> None:
@@ -381,19 +546,17 @@ def _set(program: moderngl.ComputeShader, **values: int) -> None:
             program[name] = value
 
 
-def _batches(uploaded: list[_Mesh], meshes: list[Triangles]) -> list[list[_Launch]]:
+def _batches(samples_before: list[NDArray[np.int64]]) -> list[list[_Launch]]:
     """Return launches that cover all triangles, in batches whose samples 32 bits can count."""
     batches: list[list[_Launch]] = []
     room = 0
-    for number, mesh in enumerate(meshes):
-        before = uploaded[number].samples_before
-        start = 0
-        while start < len(mesh):
+    for number, before in enumerate(samples_before):
+        start, n_triangles = 0, len(before) - 1
+        while start < n_triangles:
             if before[start + 1] - before[start] > room:
                 batches.append([])
                 room = _MAX_SAMPLES
             stop = int(np.searchsorted(before, before[start] + room, side="right")) - 1
-            stop = min(stop, len(mesh))
             batches[-1].append(_Launch(number, start, stop))
             room -= int(before[stop] - before[start])
             start = stop

@@ -1,6 +1,6 @@
 // # What the rectangle around a projection proves, in one camera
 //
-// Inserted into volume_reject.comp.glsl and volume_sample.comp.glsl, never compiled alone.
+// Inserted into the passes of the volume query, never compiled alone.
 // NumPy reference: hull/query/bounds.py, verdicts(); the argument why rounding cannot turn the
 // proof into a guess stands there. The pads are those of single precision, which also cover what
 // is computed in double precision and rounded afterwards.
@@ -10,12 +10,17 @@
 // | binding | name      | type            | unit, frame                                          |
 // |---------|-----------|-----------------|------------------------------------------------------|
 // | block 0 | cameras   | Camera[n]       | see below                                            |
-// | block 1 | pads      | vec4[n]         | pixels times metres in x, in y; metres; unused       |
+// | block 1 | pad_rows  | vec4[2 n]       | pixels times metres, per metre of reach: x, y        |
 // | block 2 | order     | uvec4[n / 4]    | cameras, the one that rejects most first             |
 // | 0       | integrals | int[]           | object pixels above and left of a pixel corner       |
 //
 // N_CAMERAS, at least n_cameras, is the room in the blocks: 256 cameras fill 16 KiB, which every
-// device offers.
+// device offers. REJECT is 0 where rectangles are to decide nothing.
+//
+// The pads of a camera are linear in the reach of a set, its largest absolute coordinates (M in
+// bounds.py). So each set has pads of its own, from its own corners, and a mesh that moves needs
+// no look at all its vertices before. The two rows are exact to 1e-7; bounds.py has 2 u B_k to
+// spare of its 32 u B_k.
 
 struct Camera {
     vec4 img_from_local[3];   // rows of the projection: pixels from metres, local frame
@@ -23,7 +28,7 @@ struct Camera {
 };
 
 layout(std140, binding = 0) uniform Cameras { Camera cameras[N_CAMERAS]; };
-layout(std140, binding = 1) uniform Pads { vec4 pads[N_CAMERAS]; };
+layout(std140, binding = 1) uniform Pads { vec4 pad_rows[2 * N_CAMERAS]; };
 layout(std140, binding = 2) uniform Order { uvec4 order[N_CAMERAS / 4]; };
 layout(std430, binding = 0) readonly buffer Integrals { int integrals[]; };
 
@@ -37,15 +42,51 @@ const uint ACCEPTS = 1u;    // every sample is seen, on an object pixel
 const uint ABSTAINS = 2u;   // no sample is seen
 const uint UNDECIDED = 3u;
 
-uint camera_vote(uint c, vec2 low, vec2 high, float depth_min_m, float depth_max_m) {
+// The same numbers as in hull/query/bounds.py.
+const uint FREE = 0u;
+const uint OPEN = 1u;
+const uint FULL = 2u;
+
+// Where the corners of a set fall in one camera.
+struct Extent {
+    vec2 low_px, high_px;
+    float depth_min_m, depth_max_m;
+};
+
+const Extent NOWHERE = Extent(vec2(1e30), vec2(-1e30), 1e30, -1e30);
+
+void widen(inout Extent extent, vec2 pixel, float depth_m) {
+    extent.low_px = min(extent.low_px, pixel);
+    extent.high_px = max(extent.high_px, pixel);
+    extent.depth_min_m = min(extent.depth_min_m, depth_m);
+    extent.depth_max_m = max(extent.depth_max_m, depth_m);
+}
+
+void widen_by_point(inout Extent extent, uint c, vec3 point_local) {
+    vec4 h = vec4(point_local, 1.0);
+    float depth_m = dot(cameras[c].img_from_local[2], h);
+    vec2 pixel = vec2(dot(cameras[c].img_from_local[0], h), dot(cameras[c].img_from_local[1], h));
+    widen(extent, pixel / depth_m, depth_m);
+}
+
+// By how much rectangles grow in x and y, pixels times metres, and from which depth this holds.
+// `reach_m` holds the largest absolute coordinates of the set, and 1.
+vec3 pads_of(uint c, vec4 reach_m) {
+    vec2 pad = vec2(dot(pad_rows[2u * c], reach_m), dot(pad_rows[2u * c + 1u], reach_m));
+    float far_px = 2.0 * float(max(cameras[c].image.x, cameras[c].image.y));
+    return vec3(pad, max(8.0 * max(pad.x, pad.y) / far_px, 1e-30));
+}
+
+uint camera_vote(uint c, Extent extent, vec3 pads) {
+    if (REJECT == 0) return UNDECIDED;
     vec2 size_px = vec2(cameras[c].image.xy);
     // One pixel beyond the image says as much as any farther out.
     vec2 first = vec2(-1.0), last = size_px;
-    if (depth_min_m >= pads[c].z) {
-        vec2 pad_px = pads[c].xy / depth_min_m;
-        first = floor(clamp(low - pad_px, vec2(-1.0), size_px));
-        last = floor(clamp(high + pad_px, vec2(-1.0), size_px));
-    } else if (depth_max_m <= -pads[c].z) {
+    if (extent.depth_min_m >= pads.z) {
+        vec2 pad_px = pads.xy / extent.depth_min_m;
+        first = floor(clamp(extent.low_px - pad_px, vec2(-1.0), size_px));
+        last = floor(clamp(extent.high_px + pad_px, vec2(-1.0), size_px));
+    } else if (extent.depth_max_m <= -pads.z) {
         last = vec2(-1.0);
     }
     ivec2 start = max(ivec2(first), ivec2(0));
@@ -60,7 +101,13 @@ uint camera_vote(uint c, vec2 low, vec2 high, float depth_min_m, float depth_max
               - integrals[base + uint(stop.y) * stride + uint(start.x)]
               + integrals[base + uint(start.y) * stride + uint(start.x)];
     if (count == 0 && (wholly_seen || keep == 0u)) return REJECTS;
-    ivec2 extent = stop - start;
-    if (wholly_seen && count == extent.x * extent.y) return ACCEPTS;
+    ivec2 extent_px = stop - start;
+    if (wholly_seen && count == extent_px.x * extent_px.y) return ACCEPTS;
     return UNDECIDED;
+}
+
+// What the votes of all cameras prove, none of which rejects.
+uint verdict(uint n_accept, uint n_abstain) {
+    if (n_cameras - n_abstain < min_cameras) return FREE;
+    return n_accept + n_abstain == n_cameras ? FULL : OPEN;
 }

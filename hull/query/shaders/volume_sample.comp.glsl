@@ -1,10 +1,11 @@
 #version 430 core
 
-// # Volume query, second pass: which samples are inside
+// # Volume query, third pass: which samples are inside
 //
 // One work group per item, a block of at most BLOCK x BLOCK samples of one triangle. First each
 // camera's rectangle around the block is asked (rectangle.glsl), then the samples, in the cameras
-// that stay undecided. Samples inside are appended to `hits` in no particular order.
+// that stay undecided. Samples inside are bits of the block's rows; the runs of each row are appended
+// to `hits`, in no particular order.
 // NumPy reference: hull/query/reference.py, contains_points().
 //
 // ## References
@@ -16,14 +17,15 @@
 //
 // | binding | name           | type           | unit, frame                                       |
 // |---------|----------------|----------------|---------------------------------------------------|
-// | 3       | vertices_local | double[3 n]    | metres about the views' local origin              |
+// | 3       | vertices_world | double[3 n]    | metres                                            |
 // | 4       | faces          | int[3 n]       | vertex numbers                                    |
 // | 5       | viewports      | int[n]         | samples along an edge                             |
 // | 6       | items          | uvec2[]        | triangle; block row << 16 + block column          |
-// | 7       | counters       | uint[]         | 4 a launch: see hull/query/compute.py             |
-// | 8       | hits           | uvec2[]        | sample; triangle, counted over all meshes         |
+// | 7       | counters       | uint[]         | 8 a launch: see hull/query/compute.py             |
+// | 8       | hits           | uvec4[]        | see hull/query/compute.py                         |
 // | 9       | masks          | uint[]         | 1 bit a pixel, row-major, lowest bit first        |
-// | 10      | img_from_local | double[12 n]   | the cameras' projections again, row-major         |
+// | 10      | origin_world   | double[3]      | metres; where the local frame has its origin      |
+// |         | img_from_local | double[12 n]   | the cameras' projections again, row-major         |
 //
 // ## Numerics
 //
@@ -49,25 +51,29 @@
 
 layout(local_size_x = GROUP) in;
 
-layout(std430, binding = 3) readonly buffer Vertices { double vertices_local[]; };
+layout(std430, binding = 3) readonly buffer Vertices { double vertices_world[]; };
 layout(std430, binding = 4) readonly buffer Faces { int faces[]; };
 layout(std430, binding = 5) readonly buffer Viewports { int viewports[]; };
 layout(std430, binding = 6) readonly buffer Items { uvec2 items[]; };
 layout(std430, binding = 7) buffer Counters { uint counters[]; };
-layout(std430, binding = 8) writeonly buffer Hits { uvec2 hits[]; };
+layout(std430, binding = 8) writeonly buffer Hits { uvec4 hits[]; };
 layout(std430, binding = 9) readonly buffer Masks { uint masks[]; };
-layout(std430, binding = 10) readonly buffer Projections { double img_from_local[]; };
+layout(std430, binding = 10) readonly buffer Projections {
+    double origin_world[3];
+    double img_from_local[];
+};
 
 uniform uint item_capacity;
 uniform uint hit_capacity;
+uniform uint hit_counter;   // index into counters
 uniform uint launch;
-uniform uint hit_counter;       // index into counters
-uniform uint triangle_number;   // what triangle 0 of this mesh is called in hits
+uniform uint mesh;
 
 const float MAX_ERROR_PX = 4e-4;
 
 // The block in space: its first sample and the steps to its neighbours, metres, local frame.
 dvec3 position, step_i, step_j;
+vec4 reach_m;   // of its triangle: see pads_of()
 
 // The block in one camera's image, about its first sample; without `is_single` only that.
 struct Look {
@@ -80,17 +86,21 @@ struct Look {
 
 shared Look looks[N_CAMERAS];
 shared uint undecided[N_CAMERAS];
-shared uint n_undecided, n_accept, n_reject;
-shared uint block_hits[BLOCK * BLOCK];
-shared uint n_block_hits, first_hit;
+shared uint n_undecided, n_accept, n_abstain, n_reject;
+shared uint rows[BLOCK];        // bit di of rows[dj]: sample (di, dj) of the block is inside
+shared uint run_places[BLOCK];  // where the runs of a row go, among those of the block
+shared uint n_runs, first_run;
 
 dvec3 vertex_local(uint triangle, int corner) {
     int number = 3 * faces[3u * triangle + uint(corner)];
-    return dvec3(vertices_local[number], vertices_local[number + 1], vertices_local[number + 2]);
+    return dvec3(vertices_world[number] - origin_world[0],
+                 vertices_world[number + 1] - origin_world[1],
+                 vertices_world[number + 2] - origin_world[2]);
 }
 
 void place_block(uint triangle, int u, ivec2 first) {
     dvec3 a = vertex_local(triangle, 0), b = vertex_local(triangle, 1), c = vertex_local(triangle, 2);
+    reach_m = vec4(vec3(max(abs(a), max(abs(b), abs(c)))), 1.0);
     if (u == 1) {   // the centroid alone
         position = (a + b + c) / 3.0LF;
         step_i = step_j = dvec3(0.0LF);
@@ -114,8 +124,7 @@ dvec3 project_row(uint c, uint row) {
 // `reach` is BLOCK - 1 steps, `rest` the steps from the block's first sample to the diagonal.
 uint block_vote(uint c, int reach, int rest) {
     dvec3 row_x = project_row(c, 0u), row_y = project_row(c, 1u), row_z = project_row(c, 2u);
-    vec2 low = vec2(1e30), high = vec2(-1e30);
-    double depth_min_m = 1e30LF, depth_max_m = -1e30LF;
+    Extent extent = NOWHERE;
     int near = min(reach, rest);
     for (int k = 0; k < 5; ++k) {
         // The five corners of a square cut by the diagonal; some coincide where it is not cut.
@@ -126,24 +135,22 @@ uint block_vote(uint c, int reach, int rest) {
         else if (k == 4) d = ivec2(min(reach, rest - near), near);
         dvec3 weights = dvec3(1.0LF, double(d.x), double(d.y));
         double depth_m = dot(row_z, weights);
-        vec2 pixel = vec2(dot(row_x, weights) / depth_m, dot(row_y, weights) / depth_m);
-        low = min(low, pixel);
-        high = max(high, pixel);
-        depth_min_m = min(depth_min_m, depth_m);
-        depth_max_m = max(depth_max_m, depth_m);
+        widen(extent, vec2(dot(row_x, weights) / depth_m, dot(row_y, weights) / depth_m),
+              float(depth_m));
     }
+    vec3 pads = pads_of(c, reach_m);
 
     looks[c].is_single = false;
-    if (depth_min_m >= double(pads[c].z)) {
+    if (extent.depth_min_m >= pads.z) {
         double per_depth = 1.0LF / row_z.x;
         dvec2 pixel = dvec2(row_x.x, row_y.x) * per_depth;
         vec2 along_i = vec2((dvec2(row_x.y, row_y.y) - pixel * row_z.y) * per_depth);
         vec2 along_j = vec2((dvec2(row_x.z, row_y.z) - pixel * row_z.z) * per_depth);
         vec2 depth_steps = vec2(row_z.yz * per_depth);
-        float smallest = float(depth_min_m * per_depth);
-        vec2 extent = float(near) * (abs(along_i) + abs(along_j)) / smallest;
+        float smallest = float(double(extent.depth_min_m) * per_depth);
+        vec2 span_px = float(near) * (abs(along_i) + abs(along_j)) / smallest;
         float depths = 1.0 + float(near) * (abs(depth_steps.x) + abs(depth_steps.y));
-        float error_px = 5.97e-8 * (max(extent.x, extent.y) * (12.0 + 6.0 * depths / smallest) + 3.0);
+        float error_px = 5.97e-8 * (max(span_px.x, span_px.y) * (12.0 + 6.0 * depths / smallest) + 3.0);
         // Far outside, the whole pixel would not fit an integer.
         if (error_px < MAX_ERROR_PX && all(lessThan(abs(pixel), dvec2(1e6LF)))) {
             dvec2 whole = floor(pixel);
@@ -155,7 +162,7 @@ uint block_vote(uint c, int reach, int rest) {
             looks[c].is_single = true;
         }
     }
-    return camera_vote(c, low, high, float(depth_min_m), float(depth_max_m));
+    return camera_vote(c, extent, pads);
 }
 
 // Return ACCEPTS on an object pixel, REJECTS on a background pixel, ABSTAINS where not seen.
@@ -194,9 +201,14 @@ bool is_inside(int di, int dj) {
     return n_seen >= min_cameras;
 }
 
+// The samples of one row of the block, `rest` steps of which are left of the diagonal, as bits.
+uint whole_row(int rest) {
+    return rest < 0 ? 0u : 0xffffffffu >> (31 - min(rest, 31));
+}
+
 void main() {
     uint lane = gl_LocalInvocationID.x;
-    uint n_items = min(counters[4u * launch + 3u], item_capacity);
+    uint n_items = min(counters[8u * launch + 7u], item_capacity);
     for (uint item = gl_WorkGroupID.x; item < n_items; item += gl_NumWorkGroups.x) {
         uint triangle = items[item].x;
         int u = viewports[triangle];
@@ -204,49 +216,54 @@ void main() {
         ivec2 first = block * ivec2(items[item].y & 0xffffu, items[item].y >> 16);
         int rest = u - 1 - first.x - first.y;
         place_block(triangle, u, first);
-        if (lane == 0u) {
-            n_undecided = 0u;
-            n_accept = 0u;
-            n_reject = 0u;
-            n_block_hits = 0u;
-        }
+        if (lane == 0u) n_undecided = n_accept = n_abstain = n_reject = n_runs = 0u;
+        for (uint row = lane; row < BLOCK; row += GROUP) rows[row] = 0u;
         barrier();
-        for (uint c = lane; c < n_cameras; c += gl_WorkGroupSize.x) {
+        for (uint c = lane; c < n_cameras; c += GROUP) {
             uint vote = block_vote(c, block - 1, rest);
             if (vote == REJECTS) atomicAdd(n_reject, 1u);
             else if (vote == ACCEPTS) atomicAdd(n_accept, 1u);
-            else if (vote == UNDECIDED) undecided[atomicAdd(n_undecided, 1u)] = c;
+            else if (vote == ABSTAINS) atomicAdd(n_abstain, 1u);
+            else undecided[atomicAdd(n_undecided, 1u)] = c;
         }
         barrier();
-        if (n_reject == 0u && n_accept + n_undecided >= min_cameras) {
+        uint found = n_reject > 0u ? FREE : verdict(n_accept, n_abstain);
+        if (found == FULL) {
+            for (uint row = lane; row < BLOCK; row += GROUP) rows[row] = whole_row(rest - int(row));
+        } else if (found == OPEN) {
             // A block that the diagonal halves holds n (n + 1) / 2 samples: row r and row n - r
             // fill one line of n together. Others are asked as squares, beyond the diagonal none.
             bool is_half = rest < block;
             int n = is_half ? rest + 1 : block;
             int count = is_half ? n * (n + 1) / 2 : n * n;
-            for (int k = int(lane); k < count; k += int(gl_WorkGroupSize.x)) {
+            for (int k = int(lane); k < count; k += int(GROUP)) {
                 int dj = k / n, di = k - dj * n;
                 if (is_half && di >= n - dj) {
                     di -= n - dj;
                     dj = n - dj;
                 }
-                if (di + dj <= rest && is_inside(di, dj)) {
-                    block_hits[atomicAdd(n_block_hits, 1u)] = uint(dj) << 16 | uint(di);
-                }
+                if (di + dj <= rest && is_inside(di, dj)) atomicOr(rows[dj], 1u << di);
             }
         }
         barrier();
-        if (lane == 0u && n_block_hits > 0u) {
-            first_hit = atomicAdd(counters[hit_counter], n_block_hits);
+        for (uint row = lane; row < BLOCK; row += GROUP) {
+            uint starts = rows[row] & ~(rows[row] << 1);
+            if (starts != 0u) run_places[row] = atomicAdd(n_runs, uint(bitCount(starts)));
         }
         barrier();
-        for (uint k = lane; k < n_block_hits; k += gl_WorkGroupSize.x) {
-            uint i = uint(first.x) + (block_hits[k] & 0xffffu);
-            uint j = uint(first.y) + (block_hits[k] >> 16);
+        if (lane == 0u && n_runs > 0u) first_run = atomicAdd(counters[hit_counter], n_runs);
+        barrier();
+        for (uint row = lane; row < BLOCK; row += GROUP) {
+            uint bits = rows[row];
             // Numbered row by row; j (j - 1) is even. See hull/query/viewport.py.
-            uint number = j * uint(u) - j * (j - 1u) / 2u + i;
-            if (first_hit + k < hit_capacity) {
-                hits[first_hit + k] = uvec2(number, triangle_number + triangle);
+            uint j = uint(first.y) + row;
+            uint row_start = j * uint(u) - j * (j - 1u) / 2u + uint(first.x);
+            for (uint run = first_run + run_places[row]; bits != 0u; ++run) {
+                uint start = uint(findLSB(bits));
+                uint stop = uint(findLSB(~bits & (0xffffffffu << start)) & 63);  // 63: to the end
+                stop = min(stop, 32u);
+                if (run < hit_capacity) hits[run] = uvec4(triangle, row_start + start, stop - start, mesh);
+                bits &= stop == 32u ? 0u : 0xffffffffu << stop;
             }
         }
         barrier();
