@@ -1,0 +1,118 @@
+"""How long a user waits: ``--help``, the first ``detect`` after an install, and every later one.
+
+Each round is a process of its own, timed from outside. ``detect`` evaluates one frame; what it says
+on stderr tells when it began with that frame (its bar appears) and when the frame was done (it says
+that it writes the report). Between the two lies learning the backgrounds of a recording, which is
+work on the recording; the session of ready masks has none.
+
+"first" finds no compiled kernel, no compiled shader and no mesh; "later" finds all of them. In both
+the files of the libraries are in memory, because earlier rounds read them: the first start after a
+boot also waits for the disk.
+"""
+
+import os
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.sessions import write_ball_session, write_cube_scene
+
+from hybridve.calib.rig_io import write_rig
+from hybridve.hull.capture.rig import calibrate_session
+from hybridve.hull.capture.session import load_session
+
+PROJECT = Path(__file__).parent.parent.parent
+
+#: What the waits are to stay below, in seconds (for the reader: nothing is asserted).
+AIM_S = {"help": 0.5, "first": 10.0, "later": 1.5}
+
+
+@dataclass
+class Waits:
+    """The waits of one process after another, in seconds from its start."""
+
+    frames_s: list[float] = field(default_factory=list)
+    first_frame_s: list[float] = field(default_factory=list)
+
+    def run(self, arguments: list[str], environment: dict[str, str]) -> None:
+        started = time.perf_counter()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hybridve.cli", *arguments],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        assert process.stderr is not None
+        seen = b""
+        while chunk := os.read(process.stderr.fileno(), 4096):
+            now_s = time.perf_counter() - started
+            for sign, waits in ((b"detect:", self.frames_s), (b"writing ", self.first_frame_s)):
+                if sign not in seen and sign in seen + chunk:
+                    waits.append(now_s)
+            seen += chunk
+        process.stderr.close()
+        assert process.wait() == 0, seen.decode()
+
+
+@pytest.fixture(scope="module", params=["masks", "horseman"])
+def job(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Return the arguments of a ``detect`` of one frame in which something collides."""
+    folder = tmp_path_factory.mktemp(request.param)
+    if request.param == "masks":
+        session = write_ball_session(folder, np.zeros((1, 3)))
+        scene = write_cube_scene(folder, {"part": (0.0, 0.0, 150.0)})
+    else:
+        recordings = request.getfixturevalue("recordings")
+        os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
+        for name in ("session.toml", "scene.toml"):
+            (folder / name).write_bytes((PROJECT / "data" / "horseman" / name).read_bytes())
+        session, scene = folder / "session.toml", folder / "scene.toml"
+        (folder / "rig").mkdir()
+        write_rig(folder / "rig" / "rig.json", calibrate_session(load_session(session)))
+    places = ["--scene", str(scene), "-o", str(folder / "report.h5"), "--overwrite"]
+    return ["detect", str(session), *places, "--frames", "0:1"]
+
+
+def with_caches(folder: Path) -> dict[str, str]:
+    """Return the environment in which all that is kept for later is kept in a folder."""
+    return os.environ | {
+        "NUMBA_CACHE_DIR": str(folder / "kernels"),
+        "MESA_SHADER_CACHE_DIR": str(folder / "shaders"),
+        "HYBRIDVE_CACHE": str(folder / "hybridve"),
+    }
+
+
+@pytest.mark.parametrize("engine", ["native", "compute"])
+@pytest.mark.parametrize("start", ["first", "later"])
+def bench_detect(benchmark: Any, tmp_path: Path, job: list[str], start: str, engine: str) -> None:
+    """From the command to its end; the waits up to the frames and the first one are beside it."""
+    waits = Waits()
+    arguments = [*job, "--engine", engine]
+    if start == "later":
+        Waits().run(arguments, with_caches(tmp_path / "0"))
+    folders = (tmp_path / ("0" if start == "later" else str(number)) for number in range(100))
+
+    def setup() -> tuple[tuple[Any, ...], dict[str, Any]]:
+        return (arguments, with_caches(next(folders))), {}
+
+    benchmark.pedantic(waits.run, setup=setup, rounds=3 if start == "first" else 9)
+    for name, values in (("frames", waits.frames_s), ("first_frame", waits.first_frame_s)):
+        benchmark.extra_info[f"{name}_after_s"] = round(statistics.median(values), 2)
+        benchmark.extra_info[f"{name}_after_min_s"] = round(min(values), 2)
+    benchmark.extra_info["aim_s"] = AIM_S[start]
+    for kept in ("kernels", "shaders", "hybridve"):
+        files = [path for path in (tmp_path / "0" / kept).rglob("*") if path.is_file()]
+        benchmark.extra_info[f"{kept}_files"] = len(files)
+
+
+def bench_help(benchmark: Any) -> None:
+    """``hybridve --help``, whole."""
+    benchmark.extra_info["aim_s"] = AIM_S["help"]
+    environment = dict(os.environ)
+    benchmark.pedantic(Waits().run, args=(["--help"], environment), rounds=15, warmup_rounds=1)
