@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import click
 
-EngineName = Literal["auto", "compute", "native", "reference"]
+EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
@@ -64,7 +64,10 @@ engine_option = click.option(
     type=click.Choice(get_args(EngineName)),
     default="auto",
     show_default=True,
-    help="What answers the volume query: compute (OpenGL 4.3), native (CPU), reference (slow).",
+    help=(
+        "What answers the volume query: compute (OpenGL 4.3), native (CPU), stencil (the method as "
+        "published in 2003, to compare with), reference (slow)."
+    ),
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 quiet_progress = click.option(

@@ -20,7 +20,7 @@ def open_engine(name: EngineName = "auto") -> Engine:
     Raises
     ------
     DeviceError
-        If ``compute`` is asked for and there is no OpenGL 4.3 device.
+        If ``compute`` or ``stencil`` is asked for and there is no OpenGL 4.3 device.
     ValueError
         If there is no engine of that name.
     """
@@ -33,13 +33,17 @@ def open_engine(name: EngineName = "auto") -> Engine:
         from hybridve.hull.query.compute import Compute
 
         return Compute()
+    if name == "stencil":
+        from hybridve.hull.query.stencil import Stencil
+
+        return Stencil()
     if name == "auto" and (hardware := _open_on_hardware()) is not None:
         return hardware
     if name in ("auto", "native"):
         from hybridve.hull.query.native import Native
 
         return Native()
-    raise ValueError(f"engine {name!r}, expected auto, compute, native or reference")
+    raise ValueError(f"engine {name!r}, expected auto, compute, native, stencil or reference")
 
 
 def _open_on_hardware() -> Engine | None:

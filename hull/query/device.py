@@ -74,12 +74,39 @@ def compile_compute(context: moderngl.Context, name: str, *parts: str) -> modern
     DeviceError
         If the driver does not compile it.
     """
-    source = load_shader(name).replace("// INSERT\n", "\n".join(parts) + "\n")
     try:
-        return context.compute_shader(source)
+        return context.compute_shader(_assembled(name, parts))
     except moderngl.Error as error:
-        complaint = " ".join(str(error).split())
-        raise DeviceError(
-            f"{renderer_name(context)} does not compile {name} ({complaint}); expected OpenGL 4.3 "
-            "with double precision: update the graphics driver, or take --engine native"
-        ) from error
+        raise _does_not_compile(context, name, error) from error
+
+
+def compile_program(
+    context: moderngl.Context, vertex: str, geometry: str, fragment: str, *parts: str
+) -> moderngl.Program:
+    """Return the program of three shader files, with `parts` before the body of each.
+
+    Raises
+    ------
+    DeviceError
+        If the driver does not compile it.
+    """
+    try:
+        return context.program(
+            vertex_shader=_assembled(vertex, parts),
+            geometry_shader=_assembled(geometry, parts),
+            fragment_shader=_assembled(fragment, parts),
+        )
+    except moderngl.Error as error:
+        raise _does_not_compile(context, f"{vertex} with {fragment}", error) from error
+
+
+def _assembled(name: str, parts: tuple[str, ...]) -> str:
+    return load_shader(name).replace("// INSERT\n", "\n".join(parts) + "\n")
+
+
+def _does_not_compile(context: moderngl.Context, name: str, error: Exception) -> DeviceError:
+    complaint = " ".join(str(error).split())
+    return DeviceError(
+        f"{renderer_name(context)} does not compile {name} ({complaint}); expected OpenGL 4.3 "
+        "with double precision: update the graphics driver, or take --engine native"
+    )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import MAX_VIEWPORT, expand_runs, samples_before
 
-EngineName = Literal["auto", "compute", "native", "reference"]
+EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)

@@ -27,6 +27,7 @@ from hybridve.hull.query.engine import Hits, Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.stencil import Stencil
 
 examples = settings(
     max_examples=150,
@@ -45,6 +46,13 @@ def native() -> Iterator[Native]:
 @pytest.fixture(scope="module")
 def compute() -> Iterator[Compute]:
     with Compute() as engine:
+        yield engine
+
+
+@pytest.fixture(scope="module")
+def stencil() -> Iterator[Stencil]:
+    # A small window: viewports of up to 100 pixels come in tiles, and most meshes in rounds.
+    with Stencil(window_px=70) as engine:
         yield engine
 
 
@@ -81,7 +89,7 @@ def scenes(
     )
 
 
-def ask(engine: Native | Compute | Reference, hull: Hull, mesh: Triangles) -> Hits:
+def ask(engine: Native | Compute | Stencil | Reference, hull: Hull, mesh: Triangles) -> Hits:
     (hits,) = engine.query(hull, [mesh])
     assert is_in_order(mesh, hits)
     return hits
@@ -108,6 +116,19 @@ def test_compute_takes_the_samples_of_the_reference(
     hull, mesh = scene
 
     found, expected = ask(compute, hull, mesh), ask(Reference(), hull, mesh)
+
+    assert differences(hull.views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+
+
+@pytest.mark.gl
+@examples
+@given(scene=scenes())
+def test_stencil_takes_the_samples_of_the_reference(
+    stencil: Stencil, scene: tuple[Hull, Triangles]
+) -> None:
+    hull, mesh = scene
+
+    found, expected = ask(stencil, hull, mesh), ask(Reference(), hull, mesh)
 
     assert differences(hull.views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
 
@@ -145,17 +166,17 @@ def test_another_camera_only_carves(native: Native, scene: tuple[Hull, Triangles
 
 
 @pytest.mark.gl
-@pytest.mark.parametrize("engine_type", [Reference, Native, Compute])
+@pytest.mark.parametrize("engine_type", [Reference, Native, Compute, Stencil])
 @examples
 @given(scene=scenes(), data=st.data())
 def test_a_viewport_of_twice_the_steps_loses_no_collision(
-    engine_type: type[Reference | Native | Compute],
+    engine_type: type[Reference | Native | Compute | Stencil],
     request: pytest.FixtureRequest,
     scene: tuple[Hull, Triangles],
     data: st.DataObject,
 ) -> None:
     hull, mesh = scene
-    shared = {Native: "native", Compute: "compute"}.get(engine_type)
+    shared = {Native: "native", Compute: "compute", Stencil: "stencil"}.get(engine_type)
     engine = request.getfixturevalue(shared) if shared else engine_type()
     coarse = np.array(
         data.draw(st.lists(st.integers(2, 33), min_size=len(mesh), max_size=len(mesh))), np.int64
@@ -181,8 +202,8 @@ def test_a_viewport_of_twice_the_steps_loses_no_collision(
     topology = mesh_finer.topology
     lost_hits = Hits.from_samples(topology, triangle[lost], doubled[lost].astype(np.uint32))
     nothing = Hits.from_samples(topology, triangle[:0], sample[:0])
-    # Only compute depends, within the band, on how a triangle is cut into blocks.
-    band_px = EDGE_BAND_PX if engine_type is Compute else 0.0
+    # Only OpenGL depends, within the band, on how a triangle is cut into blocks or placed.
+    band_px = EDGE_BAND_PX if engine_type in (Compute, Stencil) else 0.0
     assert differences(hull.views, mesh_finer, lost_hits, nothing, band_px).outside_band == []
 
 
