@@ -15,6 +15,7 @@ from hybridve.cli.doctor import doctor
 from hybridve.cli.render import render
 from hybridve.cli.segment import segment
 from hybridve.cli.summary import summary
+from hybridve.cli.sweep import sweep
 from hybridve.cli.synth import synth
 
 #: Exit status of a run that was interrupted, as shells have it: 128 + SIGINT.
@@ -53,7 +54,7 @@ def cli(verbose: int, quiet: bool) -> None:
     )
 
 
-for command in (demo, synth, calibrate, segment, detect, summary, render, doctor):
+for command in (demo, synth, calibrate, segment, detect, sweep, summary, render, doctor):
     cli.add_command(command)
 
 for command in (cli, *cli.commands.values()):

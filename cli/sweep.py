@@ -1,0 +1,366 @@
+"""``hybridve sweep``: accuracy against time, over viewports and engines."""
+
+import json
+import sys
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import click
+
+from hybridve.cli import options
+from hybridve.cli.progress import StageProgress, progress_bar
+
+if TYPE_CHECKING:
+    from hybridve.hull.capture.recording import FrameRange
+    from hybridve.hull.contact.scene import Scene
+    from hybridve.hull.report.sweep_file import Sweep
+    from hybridve.hull.sweep.room import EngineRoom
+
+#: Looks of a sample into a camera that `reference` is given without being asked for: some minutes.
+_MOST_REFERENCE_LOOKS = 10**9
+
+_ENGINES: tuple[options.EngineName, ...] = tuple(
+    name for name in get_args(options.EngineName) if name != "auto"
+)
+
+
+class _Viewports(click.ParamType[tuple[int, ...]]):
+    name = "N,N,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            viewports = tuple(int(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not a list of numbers; expected 4,8,16", param, ctx)
+        if min(viewports) < 1 or max(viewports) > 65_535:
+            self.fail(f"{value!r}: viewports are 1 to 65535", param, ctx)
+        if list(viewports) != sorted(set(viewports)):
+            self.fail(f"{value!r} is not ascending; expected 4,8,16", param, ctx)
+        return viewports
+
+
+class _CommaOption(click.Option):
+    """An option that may be given several times, or once with commas."""
+
+    def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
+        parts = [part for one in value or () for part in one.split(",")]
+        return super().type_cast_value(ctx, list(dict.fromkeys(parts)))
+
+
+@click.command(short_help="Measure accuracy against time, over viewports and engines.")
+@options.session_arg
+@options.scene_option
+@options.output_option("The sweep to write, SWEEP.h5.")
+@click.option(
+    "--viewport",
+    "viewports",
+    type=_Viewports(),
+    default="4,8,16,32,64",
+    show_default=True,
+    help="Samples along every triangle's edge, ascending.",
+)
+@click.option(
+    "--engine",
+    "engines",
+    cls=_CommaOption,
+    multiple=True,
+    type=click.Choice(_ENGINES),
+    help="Which engines, as native,stencil. Default: all that this machine can open; reference "
+    "only where it takes no more than some minutes.",
+)
+@click.option(
+    "--frames",
+    type=options._Frames(),
+    help="Which frames, as a Python range: 0:100, 100:, 0:400:10, or one: 7. Default: at most 20, "
+    "spread over the recording.",
+)
+@click.option(
+    "--repeats",
+    type=click.IntRange(1, 1000),
+    default=5,
+    show_default=True,
+    help="How often each engine answers each viewport with the clock running, after once without.",
+)
+@click.option(
+    "--open-at-mm",
+    type=click.FloatRange(0, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="The truth may lack collisions smaller than a disc of this diameter.",
+)
+@click.option(
+    "--accuracy-mm",
+    type=click.FloatRange(0, min_open=True),
+    help="Mark the point where each triangle takes the smallest viewport that samples its edges "
+    "at most this far apart. Default: what the middle viewport predicts.",
+)
+@click.option(
+    "--picture",
+    type=click.Path(path_type=Path),
+    help="The picture to draw, a .png, .svg or .pdf. Default: the output's name with .png.",
+)
+@options.json_option
+@options.overwrite_option
+@options.quiet_progress
+def sweep(
+    session: Path,
+    scene: Path,
+    output: Path,
+    viewports: tuple[int, ...],
+    engines: tuple[options.EngineName, ...],
+    frames: "FrameRange | None",
+    repeats: int,
+    open_at_mm: float,
+    accuracy_mm: float | None,
+    picture: Path | None,
+    as_json: bool,
+    overwrite: bool,
+    progress: bool,
+) -> None:
+    r"""Measure what each viewport and engine costs on SESSION, and what it misses.
+
+    Truth comes from certificates and from dense samples, not from the largest viewport. Times are
+    medians over repeats in which viewports and engines take turns.
+
+    \b
+    Example:
+      hybridve sweep data/horseman --scene data/horseman/scene.toml -o sweep.h5
+      hybridve sweep my_session --scene scene.toml --viewport 4,8,16 --engine native -o sweep.h5
+    """
+    import cv2
+
+    from hybridve.hull.capture.session import load_session
+    from hybridve.hull.contact.scene import load_scene
+    from hybridve.hull.evaluate import (
+        EvaluateSettings,
+        about_objects,
+        count_frames,
+        make_chain,
+        resolved_settings,
+    )
+    from hybridve.hull.query.certify import certify_triangles
+    from hybridve.hull.query.choose import open_engine
+    from hybridve.hull.report.machine import machine_text, software_versions
+    from hybridve.hull.report.sweep_file import (
+        Sweep,
+        read_sweep,
+        sweep_as_dict,
+        utc_now,
+        write_sweep,
+    )
+    from hybridve.hull.report.write import refuse_existing
+    from hybridve.hull.sweep.experiment import make_rows, run_sweep, samples_asked
+    from hybridve.hull.sweep.frames import read_hulls, spread_frames
+    from hybridve.hull.sweep.picture import write_picture_of
+    from hybridve.hull.sweep.room import EngineRoom
+    from hybridve.hull.view.chart import SUFFIXES
+
+    cv2.setNumThreads(1)
+    picture = output.with_suffix(".png") if picture is None else picture
+    if picture.suffix.lower() not in SUFFIXES:
+        raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
+    if picture == output:
+        raise click.UsageError(f"{output} cannot be both sweep and picture; give --picture a name")
+    for path in (output, picture):
+        refuse_existing(path, overwrite=overwrite)
+
+    loaded_scene = load_scene(scene)
+    accuracy_m = (
+        _middle_accuracy_m(loaded_scene, viewports) if accuracy_mm is None else accuracy_mm / 1e3
+    )
+    settings = EvaluateSettings(viewport=None, accuracy_m=accuracy_m)
+    if frames is not None:
+        settings = replace(settings, frames=frames)
+    chain = make_chain(load_session(session), loaded_scene, settings)
+    if frames is None:
+        spread = spread_frames(count_frames(chain))
+        chain = replace(chain, settings=replace(settings, frames=spread))
+    rows = make_rows(loaded_scene.objects, viewports, accuracy_m)
+
+    with ExitStack() as stack:
+        rooms = _open_rooms(engines, stack)
+        with progress_bar("silhouettes", count_frames(chain), enabled=progress) as advance:
+            hulls = read_hulls(chain, StageProgress(enabled=progress), advance)
+        looks = samples_asked(hulls, rows) * len(chain.views) * (repeats + 1)
+        if not engines and looks > _MOST_REFERENCE_LOOKS:
+            rooms = [room for room in rooms if room.engine.name != "reference"]
+            click.echo(
+                f"reference is left out: {looks:.1e} looks of samples into cameras take it about "
+                f"{looks / 1e7 / 60:.0f} minutes; name it with --engine to have it",
+                err=True,
+            )
+        if any(room.engine.name == "native" for room in rooms):
+            truth_room = next(room for room in rooms if room.engine.name == "native")
+        else:
+            truth_room = stack.enter_context(EngineRoom(partial(open_engine, "native")))
+        steps = len(hulls) + len(rows) * len(rooms) * (repeats + 1)
+        with progress_bar("sweep", steps, unit="step", enabled=progress) as advance:
+            outcome = run_sweep(
+                hulls,
+                rows,
+                rooms,
+                certify=certify_triangles,
+                open_at_m=open_at_mm / 1e3,
+                truth_room=truth_room,
+                repeats=repeats,
+                advance=advance,
+            )
+    write_sweep(
+        output,
+        Sweep(
+            command=" ".join(["hybridve", *sys.argv[1:]]),
+            machine=machine_text(),
+            created_utc=utc_now(),
+            versions=software_versions(),
+            settings={
+                **resolved_settings(chain),
+                "viewports": list(viewports),
+                "engines": [room.engine.name for room in rooms],
+                "repeats": repeats,
+                "open_at_m": open_at_mm / 1e3,
+                "objects": list(about_objects(chain)),
+            },
+            cameras=len(chain.views),
+            rows=outcome.rows,
+            frames=outcome.frames,
+            truth=outcome.truth,
+            engines=outcome.engines,
+        ),
+    )
+    written = read_sweep(output)
+    write_picture_of(picture, written)
+    if not written.frames.triangles_colliding.any():
+        click.echo(
+            f"nothing collides in the frames {chain.settings.frames}: accuracy cannot be measured "
+            "there, only time; choose others with --frames",
+            err=True,
+        )
+    if as_json:
+        names = {"sweep": str(output), "picture": str(picture)}
+        click.echo(json.dumps({**names, **sweep_as_dict(written)}))
+    else:
+        _print_table(output, picture, written)
+
+
+def _middle_accuracy_m(scene: "Scene", viewports: tuple[int, ...]) -> float:
+    """Return what the middle viewport predicts: the largest edge / (u - 1) of the scene."""
+    from hybridve.hull.contact.detect import make_body
+
+    middle = viewports[len(viewports) // 2]
+    return max(make_body(one, viewport=middle).spacing_m for one in scene.objects)
+
+
+def _open_rooms(engines: tuple[options.EngineName, ...], stack: ExitStack) -> list["EngineRoom"]:
+    """Return the engines that were named, or else all that can be opened."""
+    from hybridve.calib.errors import DeviceError
+    from hybridve.hull.query.choose import open_engine
+    from hybridve.hull.sweep.room import EngineRoom
+
+    rooms = []
+    for name in engines or _ENGINES:
+        try:
+            rooms.append(stack.enter_context(EngineRoom(partial(open_engine, name))))
+        except (DeviceError, ImportError) as error:  # ImportError: moderngl without its libraries
+            if engines:
+                raise DeviceError(f"engine {name}: {error}") from error
+            click.echo(f"{name} is left out: {error}", err=True)
+    return rooms
+
+
+def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
+    from hybridve.hull.report.sweep_file import sweep_as_dict
+
+    found = sweep_as_dict(sweep)
+    truth = found["truth"]
+    click.echo(f"{output}, {picture}: {len(found['frames'])} frames {sweep.settings['frames']}")
+    share = truth["open_share"]
+    click.echo(
+        f"  truth: {truth['triangles_colliding']} of {truth['triangles_asked']} triangles asked "
+        f"collide, {'-' if share is None else f'{100 * share:.2f}'} % are open below "
+        f"{1e3 * truth['open_at_m']:g} mm; distances from {truth['points']} points, sampled every "
+        f"{_mm(truth['spacing_m'])} mm"
+    )
+    lines = [
+        (
+            "engine",
+            "viewport",
+            "ms a frame (IQR)",
+            "query",
+            "place",
+            "points",
+            "missed triangles",
+            "objects",
+            "distance mm, largest",
+            "99 %",
+            "median",
+            "predicted",
+            "within",
+            "front",
+        )
+    ]
+    for engine in found["engines"]:
+        for row in engine["rows"]:
+            missed = row["triangles_missed_share"]
+            lines.append(
+                (
+                    engine["name"],
+                    row["label"],
+                    f"{row['ms_median']:.3g} ({row['ms_iqr']:.2g})",
+                    f"{row['query_ms_median']:.3g}",
+                    f"{row['place_ms_median']:.3g}",
+                    f"{row['points']:.0f}",
+                    "-" if missed is None else f"{row['triangles_missed']} ({100 * missed:.2g} %)",
+                    "-" if missed is None else f"{row['objects_missed']}",
+                    _mm(row["distance_max_m"]),
+                    _mm(row["distance_p99_m"]),
+                    _mm(row["distance_median_m"]),
+                    _mm(row["predicted_near_m"]),
+                    _share(row["within_predicted"]),
+                    "*" if row["on_front"] else "",
+                )
+            )
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    for line in lines:
+        cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
+        click.echo("  " + "  ".join(cells).rstrip())
+    for engine in found["engines"]:
+        click.echo(f"  {engine['name']}: {_cost_text(engine['cost'])}")
+    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in found["stage_ms_mean"].items())
+    click.echo(f"  once a frame, ms mean: {stages}")
+
+
+def _mm(metres: float | None) -> str:
+    return "-" if metres is None else f"{1e3 * metres:.3g}"
+
+
+def _share(share: float | None) -> str:
+    """Return a share in percent, "all" only if it is."""
+    return "-" if share is None else "all" if share == 1.0 else f"{min(100 * share, 99.99):.2f} %"
+
+
+def _cost_text(cost: dict[str, Any] | None) -> str:
+    if cost is None:
+        return "the cost model needs three viewports and an object near the hull"
+    text = (
+        f"{1e3 * cost['fixed_s']:.3g} ms a frame (at most {1e9 * cost['transform_most_s']:.3g} ns "
+        f"a transform) + {1e9 * cost['fill_s_per_px']:.3g} ns a pixel filled + "
+        f"{1e9 * cost['read_back_s_per_px']:.3g} ns a {cost['read_back']} read back"
+    )
+    text += (
+        f"; off by {100 * cost['residual_rms']:.2g} % rms, {100 * cost['residual_most']:.2g} % "
+        "at most"
+    )
+    if cost["freedom"] == 0:
+        text += " (as many terms as viewports: that proves nothing)"
+    elif cost["residual_most"] > 0.2:
+        text += ": the paper's model does not hold here, cost follows the surface near the hull"
+    if cost["condition"] > 100:
+        text += "; fill and read-back grow alike and are hardly told apart"
+    return text

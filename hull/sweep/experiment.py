@@ -1,0 +1,494 @@
+"""Engines and viewports on the same frames: what each costs, and what it misses.
+
+Every engine is asked every row (a viewport for all triangles, or the viewports of an accuracy) of
+all frames: once to warm up, when the answers are judged by the truth, and then several times with
+the clock running. Within each of these repeats rows and engines take turns, so that a machine that
+grows slower meanwhile is slower for all alike. A hull is a new one each time it is asked, as in a
+recording, so that its upload counts.
+"""
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.hull.contact.detect import Body, make_body
+from hybridve.hull.contact.scene import SceneObject
+from hybridve.hull.query.engine import Engine, Hits
+from hybridve.hull.query.viewport import hit_positions
+from hybridve.hull.report.sweep_file import EngineSweep, SweepFrames, SweepRows, TruthSettings
+from hybridve.hull.sweep.cost import fit_cost, window_px_read
+from hybridve.hull.sweep.frames import HullFrame
+from hybridve.hull.sweep.front import pareto_front
+from hybridve.hull.sweep.room import EngineRoom
+from hybridve.hull.sweep.truth import (
+    COLLIDING,
+    FINER,
+    FREE,
+    OPEN,
+    BodyTruth,
+    Certify,
+    affordable_spacing,
+    certify_body,
+    dense_mesh,
+    longest_edges,
+    nearest_distances,
+    sample_body,
+    touched_triangles,
+)
+
+#: Points of the truth kept of one object in one frame, beside the witnesses.
+TRUTH_POINTS = 50_000
+
+#: By how much a distance may exceed the accuracy predicted: reported points are stored in single
+#: precision, 1e-7 of some metres.
+_ROUNDING_M = 1e-6
+
+#: Tells the time in seconds.
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """One way to lay the scene into viewports.
+
+    Attributes
+    ----------
+    viewport : int
+        Samples along every edge; 0 where `accuracy_m` gives each triangle its own.
+    accuracy_m : float
+        The largest spacing of samples along an edge; NaN where `viewport` is given.
+    bodies : list of Body
+        The objects.
+    """
+
+    viewport: int
+    accuracy_m: float
+    bodies: list[Body]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What a sweep found: the parts of a `Sweep` that were measured."""
+
+    rows: SweepRows
+    frames: SweepFrames
+    truth: TruthSettings
+    engines: tuple[EngineSweep, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Truth:
+    """The truth of all frames, per frame a `BodyTruth` of each body that is near."""
+
+    frames: list[dict[int, BodyTruth]]
+    settings: TruthSettings
+    certify_s: NDArray[np.float64]
+    sample_s: NDArray[np.float64]
+    near_triangles: list[NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judgement:
+    """What one engine's answer to one row is worth, over all frames."""
+
+    n_points: int
+    triangles_missed: int
+    objects_missed: int
+    triangles_against_proof: int
+    distances_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Work:
+    """What the cost model counts, a frame: n m; per row n m u^2 / 2 and pixels of windows."""
+
+    transforms: float
+    fill_px: NDArray[np.float64]
+    window_px: NDArray[np.float64]
+    is_uniform: NDArray[np.bool_]
+
+
+def make_rows(
+    objects: Sequence[SceneObject], viewports: Sequence[int], accuracy_m: float
+) -> list[Row]:
+    """Return a row for each viewport, and last the one of an accuracy.
+
+    Raises
+    ------
+    ValueError
+        If the accuracy needs a viewport too large.
+    """
+    rows = [
+        Row(viewport, np.nan, [make_body(one, viewport=viewport) for one in objects])
+        for viewport in viewports
+    ]
+    chosen = [make_body(one, accuracy_m=accuracy_m) for one in objects]
+    return [*rows, Row(0, accuracy_m, chosen)]
+
+
+def samples_asked(frames: Sequence[HullFrame], rows: Sequence[Row]) -> int:
+    """Return how many samples an engine that rejects nothing looks at to answer all rows once."""
+    return sum(
+        int(body.triangles.topology.samples_before[-1])
+        for frame in frames
+        for row in rows
+        for body, is_near in zip(row.bodies, frame.near, strict=True)
+        if is_near
+    )
+
+
+def run_sweep(
+    frames: Sequence[HullFrame],
+    rows: Sequence[Row],
+    rooms: Sequence[EngineRoom],
+    *,
+    certify: Certify,
+    open_at_m: float,
+    truth_room: EngineRoom,
+    repeats: int,
+    clock: Clock = time.perf_counter,
+    advance: Callable[[], object] = lambda: None,
+) -> Outcome:
+    """Return what every engine costs and misses in every row.
+
+    Parameters
+    ----------
+    frames : sequence of HullFrame
+        F > 0 frames.
+    rows : sequence of Row
+        U > 0 ways to lay the same bodies into viewports.
+    rooms : sequence of EngineRoom
+        The engines to compare.
+    certify, open_at_m
+        What certifies triangles, and up to what a collision may go unnoticed.
+    truth_room : EngineRoom
+        An engine in double precision, to sample the truth.
+    repeats : int
+        R > 0.
+    clock : callable
+        Tells the time in seconds.
+    advance : callable
+        Told after each frame of truth, and each time an engine has answered a row:
+        F + U (R + 1) times the number of engines.
+    """
+    truth = _find_truth(frames, rows, certify, open_at_m, truth_room, advance)
+    judged = _judge_all(frames, rows, rooms, truth, advance)
+    query_s = np.zeros((len(rooms), len(rows), repeats))
+    place_s = np.zeros_like(query_s)
+    for repeat in range(repeats):
+        for number, row in enumerate(rows):
+            for engine, room in enumerate(rooms):
+                at = (engine, number, repeat)
+                query_s[at], place_s[at] = room.call(
+                    _answer_in_time, room.engine, frames, row, clock
+                )
+                advance()
+
+    largest_m = np.array([[_largest(one.distances_m) for one in row] for row in judged])  # (E, U)
+    costs = np.column_stack(
+        [
+            np.median(query_s + place_s, axis=2).ravel(),
+            largest_m.ravel(),
+            [one.objects_missed for row in judged for one in row],
+        ]
+    )
+    on_front = pareto_front(costs).reshape(len(rooms), len(rows))
+    work = _count_work(frames, rows)
+    columns = _row_columns(rows, truth.near_triangles)
+    return Outcome(
+        columns,
+        _frame_columns(frames, rows[0].bodies, truth),
+        truth.settings,
+        tuple(
+            _engine_sweep(
+                room.engine,
+                len(frames),
+                work,
+                columns.predicted_near_m,
+                judged[engine],
+                query_s[engine],
+                place_s[engine],
+                on_front[engine],
+            )
+            for engine, room in enumerate(rooms)
+        ),
+    )
+
+
+def _find_truth(
+    frames: Sequence[HullFrame],
+    rows: Sequence[Row],
+    certify: Certify,
+    open_at_m: float,
+    room: EngineRoom,
+    advance: Callable[[], object],
+) -> _Truth:
+    bodies = rows[0].bodies
+    found: list[dict[int, BodyTruth]] = []
+    certify_s, sample_s = np.zeros(len(frames)), np.zeros(len(frames))
+    near_triangles = [np.zeros(len(body.triangles), np.bool_) for body in bodies]
+    for number, frame in enumerate(frames):
+        started = time.perf_counter()
+        found.append(
+            {
+                index: certify_body(frame.hull, bodies[index], certify, open_at_m)
+                for index in np.flatnonzero(frame.near).tolist()
+            }
+        )
+        for index, one in found[-1].items():
+            near_triangles[index] |= one.verdict != FREE
+        certify_s[number] = time.perf_counter() - started
+        advance()
+
+    finest_m = min(_predicted(row, near_triangles) for row in rows)
+    spacing_wanted_m = spacing_m = finest_m / FINER
+    if finest_m > 0:  # neither NaN, where nothing is near, nor 0, where all that is has no size
+        edges_m = np.concatenate(
+            [
+                longest_edges(body.triangles)[near]
+                for body, near in zip(bodies, near_triangles, strict=True)
+            ]
+        )
+        spacing_m = affordable_spacing(edges_m, spacing_wanted_m)
+        dense = [
+            dense_mesh(body.triangles, near, spacing_m)
+            for body, near in zip(bodies, near_triangles, strict=True)
+        ]
+        for number, frame in enumerate(frames):
+            started = time.perf_counter()
+            for index, one in found[number].items():
+                if (one.verdict != FREE).any():
+                    found[number][index] = room.call(
+                        sample_body, frame.hull, one, dense[index], room.engine, TRUTH_POINTS
+                    )
+            sample_s[number] = time.perf_counter() - started
+    settings = TruthSettings(open_at_m, spacing_wanted_m, spacing_m, TRUTH_POINTS)
+    return _Truth(found, settings, certify_s, sample_s, near_triangles)
+
+
+def _judge_all(
+    frames: Sequence[HullFrame],
+    rows: Sequence[Row],
+    rooms: Sequence[EngineRoom],
+    truth: _Truth,
+    advance: Callable[[], object],
+) -> list[list[_Judgement]]:
+    """Return what every engine's answer to every row is worth: engines, then rows."""
+    judged: list[list[_Judgement]] = [[] for _ in rooms]
+    for row in rows:
+        known: dict[bytes, NDArray[np.float64]] = {}
+        for engine, room in enumerate(rooms):
+            judged[engine].append(
+                room.call(_judge_row, room.engine, frames, row, truth.frames, known)
+            )
+            advance()
+    return judged
+
+
+def _judge_row(
+    engine: Engine,
+    frames: Sequence[HullFrame],
+    row: Row,
+    truth: list[dict[int, BodyTruth]],
+    known: dict[bytes, NDArray[np.float64]],
+) -> _Judgement:
+    """Return what an engine's answer to a row is worth.
+
+    Engines mostly agree to the sample: `known` keeps the distances by what was answered.
+    """
+    n_points = triangles_missed = objects_missed = against_proof = 0
+    distances_m = [np.zeros(0)]
+    for number, frame in enumerate(frames):
+        for index, hits in _answer(engine, frame, row).items():
+            one = truth[number][index]
+            n_points += len(hits)
+            touched = np.zeros(len(one.verdict), np.bool_)
+            touched[touched_triangles(hits)[0]] = True
+            triangles_missed += int((~touched & (one.verdict == COLLIDING)).sum())
+            against_proof += int((touched & (one.verdict == FREE)).sum())
+            if one.collides and len(hits) == 0:
+                objects_missed += 1
+            if len(hits) == 0 or len(one.points_world) == 0:
+                continue
+            key = hashlib.sha256(b"%d %d" % (number, index))
+            key.update(hits.start.tobytes() + hits.stop.tobytes())
+            if key.digest() not in known:
+                reported_world = _place(row.bodies[index], hits)
+                known[key.digest()] = nearest_distances(one.points_world, reported_world)
+            distances_m.append(known[key.digest()])
+    return _Judgement(
+        n_points, triangles_missed, objects_missed, against_proof, np.concatenate(distances_m)
+    )
+
+
+def _answer(engine: Engine, frame: HullFrame, row: Row) -> dict[int, Hits]:
+    """Return an engine's hits on the bodies that are near."""
+    near = np.flatnonzero(frame.near).tolist()
+    hull = replace(frame.hull)  # the same arrays, but a hull that no engine has seen
+    hits = engine.query(hull, [row.bodies[index].triangles for index in near])
+    return dict(zip(near, hits, strict=True))
+
+
+def _answer_in_time(
+    engine: Engine, frames: Sequence[HullFrame], row: Row, clock: Clock
+) -> tuple[float, float]:
+    """Return seconds a frame from hull to samples, and from samples to points."""
+    query_s = place_s = 0.0
+    for frame in frames:
+        started = clock()
+        answers = _answer(engine, frame, row)
+        answered = clock()
+        for index, hits in answers.items():
+            _place(row.bodies[index], hits)
+        query_s += answered - started
+        place_s += clock() - answered
+    return query_s / len(frames), place_s / len(frames)
+
+
+def _place(body: Body, hits: Hits) -> NDArray[np.float32]:
+    """Return where samples lie, as `detect` does it for its report."""
+    triangle, sample = hits.samples()
+    mesh = body.triangles
+    return hit_positions(
+        mesh.vertices_world,
+        mesh.faces,
+        mesh.viewports,
+        triangle,
+        sample,
+        np.zeros((len(triangle), 3), np.float32),
+    )
+
+
+def _count_work(frames: Sequence[HullFrame], rows: Sequence[Row]) -> _Work:
+    n_cameras = len(frames[0].hull.views)
+    share = np.mean([frame.near for frame in frames], axis=0)  # (B,) of the frames ask the body
+    viewports = [[body.triangles.viewports for body in row.bodies] for row in rows]
+    fill_px = np.array(
+        [[0.5 * (one.astype(np.float64) ** 2).sum() for one in row] for row in viewports]
+    )
+    window_px = np.array([[float(window_px_read(one)) for one in row] for row in viewports])
+    return _Work(
+        transforms=n_cameras * float(share @ [len(one) for one in viewports[0]]),
+        fill_px=n_cameras * fill_px @ share,
+        window_px=window_px @ share,
+        is_uniform=np.array([row.viewport > 0 for row in rows]),
+    )
+
+
+def _row_columns(rows: Sequence[Row], near_triangles: list[NDArray[np.bool_]]) -> SweepRows:
+    meshes = [[body.triangles for body in row.bodies] for row in rows]
+    return SweepRows(
+        viewport=np.array([row.viewport for row in rows], np.uint32),
+        accuracy_m=np.array([row.accuracy_m for row in rows]),
+        viewport_most=np.array(
+            [max(int(mesh.viewports.max()) for mesh in row) for row in meshes], np.uint32
+        ),
+        samples=np.array(
+            [sum(int(mesh.topology.samples_before[-1]) for mesh in row) for row in meshes],
+            np.uint64,
+        ),
+        predicted_m=np.array([max(body.spacing_m for body in row.bodies) for row in rows]),
+        predicted_near_m=np.array([_predicted(row, near_triangles) for row in rows]),
+    )
+
+
+def _predicted(row: Row, near_triangles: list[NDArray[np.bool_]]) -> float:
+    """Return the largest edge / (u - 1) of triangles that are near; NaN if there is none."""
+    spacings_m = [
+        (longest_edges(body.triangles) / np.maximum(body.triangles.viewports - 1, 1))[near]
+        for body, near in zip(row.bodies, near_triangles, strict=True)
+    ]
+    return _largest(np.concatenate(spacings_m))
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    return float(values.max()) if len(values) else float("nan")
+
+
+def _percentile(values: NDArray[np.float64], percent: float) -> float:
+    return float(np.percentile(values, percent)) if len(values) else float("nan")
+
+
+def _frame_columns(frames: Sequence[HullFrame], bodies: list[Body], truth: _Truth) -> SweepFrames:
+    lengths = np.array([len(body.triangles) for body in bodies])
+
+    def counts(verdict: int) -> NDArray[np.uint32]:
+        return np.array(
+            [
+                sum(int((one.verdict == verdict).sum()) for one in frame.values())
+                for frame in truth.frames
+            ],
+            np.uint32,
+        )
+
+    return SweepFrames(
+        index=np.array([frame.index for frame in frames], np.uint32),
+        decode_s=np.array([frame.decode_s for frame in frames]),
+        segment_s=np.array([frame.segment_s for frame in frames]),
+        hull_s=np.array([frame.hull_s for frame in frames]),
+        boxes_s=np.array([frame.boxes_s for frame in frames]),
+        certify_s=truth.certify_s,
+        sample_s=truth.sample_s,
+        triangles_asked=np.array([lengths[frame.near].sum() for frame in frames], np.uint32),
+        triangles_colliding=counts(COLLIDING),
+        triangles_open=counts(OPEN),
+        objects_colliding=np.array(
+            [sum(one.collides for one in frame.values()) for frame in truth.frames], np.uint32
+        ),
+        truth_points=np.array(
+            [sum(len(one.points_world) for one in frame.values()) for frame in truth.frames],
+            np.uint64,
+        ),
+    )
+
+
+def _engine_sweep(
+    engine: Engine,
+    n_frames: int,
+    work: _Work,
+    predicted_near_m: NDArray[np.float64],
+    judged: list[_Judgement],
+    query_s: NDArray[np.float64],
+    place_s: NDArray[np.float64],
+    on_front: NDArray[np.bool_],
+) -> EngineSweep:
+    points = np.array([one.n_points / n_frames for one in judged])
+    # Where a window is read back it is so wholly; elsewhere what was found is.
+    reads_window = engine.name == "stencil"
+    cost = fit_cost(
+        np.median(query_s + place_s, axis=1),
+        transforms=work.transforms,
+        fill_px=work.fill_px,
+        read_back_px=work.window_px if reads_window else points,
+        read_back="window pixel" if reads_window else "sample inside",
+        fitted=work.is_uniform,
+    )
+    return EngineSweep(
+        name=engine.name,
+        renderer=engine.renderer,
+        query_s=query_s,
+        place_s=place_s,
+        points=points,
+        triangles_missed=np.array([one.triangles_missed for one in judged], np.uint32),
+        objects_missed=np.array([one.objects_missed for one in judged], np.uint32),
+        triangles_against_proof=np.array(
+            [one.triangles_against_proof for one in judged], np.uint32
+        ),
+        distance_max_m=np.array([_largest(one.distances_m) for one in judged]),
+        distance_p99_m=np.array([_percentile(one.distances_m, 99) for one in judged]),
+        distance_median_m=np.array([_percentile(one.distances_m, 50) for one in judged]),
+        within_predicted=np.array(
+            [
+                float(np.mean(one.distances_m <= predicted_m + _ROUNDING_M))
+                if len(one.distances_m)
+                else np.nan
+                for one, predicted_m in zip(judged, predicted_near_m, strict=True)
+            ]
+        ),
+        on_front=on_front,
+        cost=cost,
+    )

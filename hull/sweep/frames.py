@@ -1,0 +1,146 @@
+"""The frames of a sweep: few, spread over the recording, their hulls made once and kept."""
+
+import logging
+import time
+from collections.abc import Callable, Generator
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import SessionError
+from hybridve.hull.capture.recording import (
+    FrameRange,
+    FrameSilhouettes,
+    segmented_frames,
+    stored_frames,
+)
+from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.contact.detect import Body
+from hybridve.hull.evaluate import Chain
+from hybridve.hull.query.bounds import boxes_are_free
+from hybridve.hull.query.silhouettes import Hull, make_hull
+
+_log = logging.getLogger(__name__)
+
+#: Frames that a sweep takes if it is not told which.
+MOST_FRAMES = 20
+
+#: Bytes that the hulls of a sweep may take: they stay in memory, to be asked again and again.
+_MOST_BYTES = 2 << 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HullFrame:
+    """One frame, ready to be asked.
+
+    Attributes
+    ----------
+    index : int
+        Its number in the session.
+    hull : Hull
+        What is real in it.
+    near : (B,) bool
+        Which bodies' boxes are not proved free.
+    decode_s, segment_s, hull_s, boxes_s : float
+        What that took.
+    """
+
+    index: int
+    hull: Hull
+    near: NDArray[np.bool_]
+    decode_s: float
+    segment_s: float
+    hull_s: float
+    boxes_s: float
+
+
+def spread_frames(n_frames: int, most: int = MOST_FRAMES) -> FrameRange:
+    """Return frames spread over a recording, at most so many.
+
+    Examples
+    --------
+    >>> str(spread_frames(426))
+    '0::22'
+    """
+    return FrameRange(0, None, max(1, -(-n_frames // most)))
+
+
+def read_hulls(
+    chain: Chain,
+    progress: Callable[[str, int, int], None] | None = None,
+    advance: Callable[[], object] = lambda: None,
+) -> list[HullFrame]:
+    """Return the chosen frames of a chain; those that a camera lacks are left out, with a warning.
+
+    Parameters
+    ----------
+    chain : Chain
+        The recording and the scene.
+    progress : callable, optional
+        Told ``(what, done, total)`` while the backgrounds are learnt.
+    advance : callable
+        Told after each frame.
+
+    Raises
+    ------
+    SessionError
+        If no frame can be used, or the hulls of so many do not fit into memory.
+    """
+    frames: list[HullFrame] = []
+    n_bytes = 0
+    with closing(_silhouettes(chain, progress)) as silhouettes:
+        for frame in silhouettes:
+            advance()
+            if frame.masks is None:
+                _log.warning("frame %d is left out: %s", frame.index, frame.reason)
+                continue
+            started = time.perf_counter()
+            hull = make_hull(chain.views, frame.masks)
+            made = time.perf_counter()
+            near = near_bodies(hull, chain.bodies)
+            asked = time.perf_counter()
+            n_bytes += hull.masks_flat.nbytes + hull.integrals_flat.nbytes
+            if n_bytes > _MOST_BYTES:
+                raise SessionError(
+                    f"{chain.session.path}: the hulls of {len(frames)} frames fill "
+                    f"{_MOST_BYTES >> 30} GiB of memory; take fewer with --frames START:STOP:STEP"
+                )
+            frames.append(
+                HullFrame(
+                    frame.index,
+                    hull,
+                    near,
+                    frame.decode_s,
+                    frame.segment_s,
+                    made - started,
+                    asked - made,
+                )
+            )
+    if not frames:
+        raise SessionError(
+            f"{chain.session.path}: none of the frames {chain.settings.frames} can be evaluated; "
+            "choose others with --frames"
+        )
+    return frames
+
+
+def near_bodies(hull: Hull, bodies: list[Body]) -> NDArray[np.bool_]:
+    """Tell which bodies' boxes are not proved free of the hull, (B,)."""
+    return ~boxes_are_free(
+        hull,
+        np.array([body.lower_world for body in bodies]),
+        np.array([body.upper_world for body in bodies]),
+    )
+
+
+def _silhouettes(
+    chain: Chain, progress: Callable[[str, int, int], None] | None
+) -> Generator[FrameSilhouettes, None, None]:
+    frames, lenses = chain.settings.frames, chain.undistortions
+    if chain.silhouettes is not None:
+        with SilhouetteReader(chain.silhouettes) as reader:
+            yield from stored_frames(chain.session, reader, frames, undistortions=lenses)
+        return
+    yield from segmented_frames(chain.session, frames, undistortions=lenses, progress=progress)

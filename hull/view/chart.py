@@ -1,0 +1,267 @@
+"""Accuracy against time, drawn: one curve a method, and the points that nothing beats."""
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import ReportError
+
+#: What a chart may be written as.
+SUFFIXES = (".png", ".svg", ".pdf")
+
+#: Okabe and Ito's colours, told apart by the colour-blind; a marker each for black and white.
+_STYLES = (
+    ("#0072B2", "o"),
+    ("#D55E00", "s"),
+    ("#009E73", "^"),
+    ("#CC79A7", "D"),
+    ("#E69F00", "v"),
+    ("#56B4E9", "P"),
+)
+_INK = "#333333"
+_SIZE_IN = (12.5, 6.2)
+_DPI = 130
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """One method's U points.
+
+    Attributes
+    ----------
+    name : str
+        The method.
+    labels : tuple of str
+        What each point is called, "" for one that needs no name.
+    time_ms : (U,) float64
+        Median time a frame.
+    time_range_ms : (2, U) float64
+        Quartiles of it.
+    error_mm, predicted_mm : (U,) float64
+        The largest distance measured and the one predicted; NaN where unknown.
+    missed_percent : (U,) float64
+        Share of the colliding triangles that were missed.
+    viewport : (U,) int64
+        The viewport; 0 for a point that has none, which the second panel leaves out.
+    on_front : (U,) bool
+        Points that nothing beats.
+    is_chosen : (U,) bool
+        Points to mark as the ones that an accuracy would choose.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    time_ms: NDArray[np.float64]
+    time_range_ms: NDArray[np.float64]
+    error_mm: NDArray[np.float64]
+    predicted_mm: NDArray[np.float64]
+    missed_percent: NDArray[np.float64]
+    viewport: NDArray[np.int64]
+    on_front: NDArray[np.bool_]
+    is_chosen: NDArray[np.bool_]
+
+
+def write_chart(
+    path: Path,
+    curves: Sequence[Curve],
+    chosen: str,
+    *,
+    title: str,
+    subtitle: str = "",
+    note: str = "",
+) -> None:
+    """Draw curves into a picture, which appears only when it is complete.
+
+    Parameters
+    ----------
+    path : Path
+        A .png, .svg or .pdf.
+    curves : sequence of Curve
+        One for each method.
+    chosen : str
+        What the marked points are.
+    title, subtitle : str
+        Above the curves.
+    note : str
+        Below them.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    ValueError
+        If the name has another ending.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{path}: charts are {', '.join(SUFFIXES)}")
+    figure = draw_chart(curves, chosen, title=title, subtitle=subtitle, note=note)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        figure.savefig(partial, format=path.suffix.lower()[1:], dpi=_DPI)
+        partial.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def draw_chart(
+    curves: Sequence[Curve], chosen: str, *, title: str, subtitle: str = "", note: str = ""
+) -> Figure:
+    """Return the figure of `write_chart`."""
+    figure = Figure(figsize=_SIZE_IN, layout="constrained")
+    FigureCanvasAgg(figure)
+    tradeoff, missed = figure.subplots(1, 2, width_ratios=(2.2, 1))
+    for number, curve in enumerate(curves):
+        colour, marker = _STYLES[number % len(_STYLES)]
+        _draw_tradeoff(tradeoff, curve, colour, marker)
+        # Methods mostly miss the same: each later one is drawn smaller, so that all are seen.
+        _draw_missed(missed, curve, colour, marker, shrink=number / len(curves))
+    _draw_front(tradeoff, curves)
+    _label_axes(tradeoff, missed, chosen)
+    if not any((one > 0).any() for each in curves for one in (each.error_mm, each.predicted_mm)):
+        tradeoff.set_ylim(1.0, 10.0)  # a logarithmic axis must have something to show
+    figure.suptitle("\n".join([*textwrap.wrap(title, 110), subtitle]).strip(), fontsize=10)
+    if note:
+        figure.supxlabel(note, fontsize=9, color="#B00020")
+    return figure
+
+
+def _draw_tradeoff(axes: Axes, curve: Curve, colour: str, marker: str) -> None:
+    along = curve.viewport > 0
+    spread_ms = np.abs(curve.time_range_ms - curve.time_ms)
+    # An error of nought has no place on a logarithmic axis.
+    error_mm = np.where(curve.error_mm > 0, curve.error_mm, np.nan)
+    predicted_mm = np.where(curve.predicted_mm > 0, curve.predicted_mm, np.nan)
+    axes.plot(
+        curve.time_ms[along],
+        predicted_mm[along],
+        "--",
+        color=colour,
+        linewidth=0.9,
+        alpha=0.7,
+    )
+    axes.errorbar(
+        curve.time_ms[along],
+        error_mm[along],
+        xerr=spread_ms[:, along],
+        color=colour,
+        marker=marker,
+        markersize=6,
+        linewidth=1.6,
+        capsize=2,
+        label=curve.name,
+    )
+    chosen = curve.is_chosen
+    axes.plot(
+        curve.time_ms[chosen],
+        error_mm[chosen],
+        linestyle="none",
+        marker="*",
+        markersize=15,
+        markerfacecolor=colour,
+        markeredgecolor=_INK,
+    )
+    # Where nothing was measured, the labels stand at what was predicted.
+    heights_mm = np.where(np.isnan(error_mm), predicted_mm, error_mm)
+    for time_ms, height_mm, label in zip(curve.time_ms, heights_mm, curve.labels, strict=True):
+        if label and np.isfinite(height_mm):
+            axes.annotate(
+                label,
+                (time_ms, height_mm),
+                xytext=(5, 5),
+                textcoords="offset points",
+                fontsize=8,
+                color=colour,
+            )
+
+
+def _draw_front(axes: Axes, curves: Sequence[Curve]) -> None:
+    """Draw the points that nothing beats as a staircase: what a time buys at best."""
+    front = [
+        (time_ms, error_mm)
+        for curve in curves
+        for time_ms, error_mm in zip(
+            curve.time_ms[curve.on_front], curve.error_mm[curve.on_front], strict=True
+        )
+    ]
+    if front:
+        time_ms, error_mm = np.array(sorted(front)).T
+        axes.plot(
+            time_ms,
+            error_mm,
+            drawstyle="steps-post",
+            color=_INK,
+            linewidth=6,
+            alpha=0.18,
+            solid_capstyle="round",
+            zorder=0,
+        )
+        axes.plot(
+            time_ms,
+            error_mm,
+            linestyle="none",
+            marker="o",
+            markersize=13,
+            markerfacecolor="none",
+            markeredgecolor=_INK,
+            markeredgewidth=1.4,
+        )
+
+
+def _draw_missed(axes: Axes, curve: Curve, colour: str, marker: str, shrink: float) -> None:
+    along = curve.viewport > 0
+    axes.plot(
+        curve.viewport[along],
+        curve.missed_percent[along],
+        color=colour,
+        marker=marker,
+        markersize=11 - 8 * shrink,
+        linewidth=4.5 - 3.5 * shrink,
+        label=curve.name,
+    )
+
+
+def _label_axes(tradeoff: Axes, missed: Axes, chosen: str) -> None:
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    tradeoff.set_xscale("log")
+    tradeoff.set_yscale("log")
+    tradeoff.set_xlabel("ms a frame, median and quartiles (query and positions)")
+    tradeoff.set_ylabel("mm from a true collision to the nearest reported point, largest")
+    tradeoff.grid(which="both", color="#DDDDDD", linewidth=0.5)
+    proxies = [
+        tradeoff.plot([], [], "--", color=_INK, linewidth=0.9, label="predicted, edge/(u-1)"),
+        tradeoff.plot(
+            [], [], "*", markersize=12, color="white", markeredgecolor=_INK, label=chosen
+        ),
+        tradeoff.plot(
+            [],
+            [],
+            "o",
+            markersize=10,
+            markerfacecolor="none",
+            markeredgecolor=_INK,
+            label="Pareto front",
+        ),
+    ]
+    handles, _ = tradeoff.get_legend_handles_labels()
+    lines = [line for (line,) in proxies]
+    named = [handle for handle in handles if handle not in lines]
+    tradeoff.legend(handles=[*named, *lines], fontsize=8, framealpha=0.9)
+    missed.set_xscale("log", base=2)
+    missed.set_xlabel("viewport u")
+    missed.set_ylabel("colliding triangles missed, %")
+    missed.set_ylim(bottom=0)
+    missed.grid(color="#DDDDDD", linewidth=0.5)
+    for axis in (tradeoff.xaxis, tradeoff.yaxis, missed.xaxis):
+        axis.set_major_formatter(plain)
+    for axis in (tradeoff.xaxis, tradeoff.yaxis):
+        axis.set_minor_formatter(NullFormatter())
