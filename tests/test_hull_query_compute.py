@@ -24,11 +24,12 @@ from helpers.hulls import (
     soup,
     sphere_mesh,
 )
+from numpy.typing import NDArray
 
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query import compute as compute_module
 from hybridve.hull.query import device as device_module
-from hybridve.hull.query.bounds import OPEN, verdicts
+from hybridve.hull.query.bounds import OPEN, ROUNDOFF_FLOAT32, rectangle_pads, verdicts
 from hybridve.hull.query.compute import Compute
 from hybridve.hull.query.device import open_device
 from hybridve.hull.query.engine import Triangles
@@ -73,6 +74,13 @@ def counters(engine: Compute) -> tuple[int, int]:
     """Return how many clusters and blocks the first mesh of the last query left open."""
     read = np.frombuffer(engine._counters.read(), np.uint32)
     return int(read[3]), int(read[7])
+
+
+def matrix_world(views: Views, camera: int) -> NDArray[np.float64]:
+    """Return the (3, 4) projection of a camera, from the world."""
+    matrix = views.img_from_local[camera].copy()
+    matrix[:, 3] -= matrix[:, :3] @ views.origin_world
+    return matrix
 
 
 def random_scene(seed: int, n_triangles: int, n_cameras: int = 4) -> tuple[Hull, Triangles]:
@@ -148,6 +156,32 @@ def test_a_triangle_seen_on_edge_beside_a_pixel_edge_is_not_rejected(compute: Co
     assert len(hits) == n_triangles * 55
 
 
+@pytest.mark.parametrize("inside_px", [2e-3, 1.0 - 2e-3])
+def test_a_cluster_seen_on_edge_beside_a_pixel_edge_is_not_rejected(
+    compute: Compute, inside_px: float
+) -> None:
+    """The same for the box around a cluster, flat in the plane of the camera and a pixel column."""
+    rng = np.random.default_rng(4)
+    column = 801
+    for _ in range(20):
+        camera_local = rng.uniform(20.0, 60.0, 3)
+        matrix = np.array(
+            [[1700.0, 0.0, column + inside_px], [0.0, 1700.0, 600.0], [0.0, 0.0, 1.0]]
+        )
+        matrix = matrix @ np.column_stack([np.eye(3), -camera_local])
+        views = Views(("cam",), np.array([[1600, 1200]]), matrix[None], np.zeros(3))
+        mask = np.zeros((1200, 1600), np.uint8)
+        mask[:, column] = 1
+        n_triangles = compute_module._CLUSTER
+        around = np.array([0.0, 0.0, rng.uniform(1.0, 8.0)])
+        corners = around + rng.uniform(-0.05, 0.05, (n_triangles, 3, 3)) * (0.0, 1.0, 1.0)
+        mesh = soup(views, corners + camera_local, np.full(n_triangles, 10, np.int32))
+
+        (hits,) = compute.query(make_hull(views, [mask]), [mesh])
+
+        assert len(hits) == n_triangles * 55
+
+
 def test_only_what_rectangles_leave_open_is_sampled(compute: Compute) -> None:
     views = ring_views()
     hull = ball_hull(views, np.array([0.5, 0.0, 0.0]), 0.13)
@@ -179,6 +213,21 @@ def test_a_mesh_wholly_inside_is_one_run(
     assert counters(compute) == (0, 0)
     assert hits.start.tolist() == [0]
     assert hits.stop.tolist() == [len(mesh) * 5050]
+
+
+def test_a_camera_that_turns_its_back_leaves_a_mesh_whole(compute: Compute) -> None:
+    ring = ring_views(3)
+    away = look_at(np.array([3.0, 0.0, 1.0]), np.array([6.0, 0.0, 1.0]))
+    matrices = [matrix_world(ring, k) for k in range(3)] + [projection(away, 700.0, 720, 486)]
+    sizes_px = np.array([[720, 486]] * 4)
+    views = make_views(tuple("abcd"), sizes_px, np.array(matrices), "keep", min_cameras=3)
+    mesh = sphere_mesh(200, 0.2)
+
+    (hits,) = compute.query(ball_hull(views, np.zeros(3), 0.4), [mesh])
+
+    assert counters(compute) == (0, 0)
+    assert hits.start.tolist() == [0]
+    assert hits.stop.tolist() == [len(mesh) * 55]
 
 
 def test_a_mesh_beyond_the_hull_is_dropped_by_the_cluster(compute: Compute) -> None:
@@ -240,6 +289,16 @@ def test_boxes_hold_their_clusters_and_no_more(compute: Compute) -> None:
         own = rounded[compute_module._CLUSTER * cluster :][: compute_module._CLUSTER]
         np.testing.assert_array_equal(boxes[0, :, cluster], own.min(axis=(0, 1)))
         np.testing.assert_array_equal(boxes[1, :, cluster], own.max(axis=(0, 1)))
+
+
+def test_pads_follow_from_the_reach_of_each_set() -> None:
+    views = random_views(np.random.default_rng(6), 5)
+    reaches_m = np.array([[0.0, 0.0, 0.0], [0.1, 2.0, 0.4], [30.0, 0.0, 7.0]])
+
+    pads = np.einsum("cpk,nk->ncp", compute_module._pad_rows(views), np.insert(reaches_m, 3, 1, 1))
+
+    expected = rectangle_pads(views, reaches_m, ROUNDOFF_FLOAT32)[..., :2]
+    np.testing.assert_allclose(pads, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("unseen", ["carve", "keep"])
@@ -362,18 +421,40 @@ def test_buffers_grow_when_a_frame_overflows_them(
     assert len(found) == len(mesh) * 70 * 71 // 2  # all of it is inside
 
 
-def test_a_frame_too_large_for_the_device_is_asked_in_parts(context: moderngl.Context) -> None:
-    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
-    meshes = [sphere_mesh(300, 0.1, viewport=20), sphere_mesh(200, 0.15, viewport=12)]
+def test_a_frame_too_large_for_the_device_is_asked_in_parts(
+    context: moderngl.Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compute_module, "_FIRST_SIZE", 64)
+    hull = ball_hull(ring_views(), np.array([0.1, 0.0, 0.0]), 0.2)
+    meshes = [sphere_mesh(300, 0.2, viewport=60), sphere_mesh(200, 0.2, viewport=70)]
     with Compute(context) as engine:
-        engine._largest = 1 << 15  # as if the device held no larger buffer
-        uploads = engine._upload
-        engine._upload = lambda array, what: engine._context.buffer(np.ascontiguousarray(array))
+        for mesh in meshes:  # their own buffers are larger than what follows
+            engine.query(hull, [mesh])
+        engine._items, engine._hits = engine._reserve(64), engine._reserve(64)
+        engine._largest = 1 << 12  # as if the device held no larger buffer
         found = engine.query(hull, meshes)
-        engine._upload = uploads
+        assert max(engine._items.size, engine._hits.size) <= 1 << 12
 
-    for hits, expected in zip(found, native.query(hull, meshes), strict=True):
-        assert_same_samples(hits, expected)
+    for mesh, hits, expected in zip(meshes, found, native.query(hull, meshes), strict=True):
+        assert is_in_order(mesh, hits)
+        assert differences(hull.views, mesh, hits, expected, EDGE_BAND_PX).outside_band == []
+        assert len(hits.start) > 1 << 8  # they would not fit
+
+
+@pytest.mark.parametrize("radius_m", [0.1, 0.2])
+def test_batches_may_begin_and_end_within_a_cluster(
+    compute: Compute, monkeypatch: pytest.MonkeyPatch, radius_m: float
+) -> None:
+    hull = ball_hull(ring_views(), np.array([0.05, 0.0, 0.0]), 0.2)
+    mesh = sphere_mesh(1000, radius_m)
+    (at_once,) = compute.query(hull, [mesh])
+    for n_triangles in (1, 10, 64, 100, 170):
+        monkeypatch.setattr(compute_module, "_MAX_SAMPLES", 55 * n_triangles)
+
+        (found,) = compute.query(hull, [mesh])
+
+        np.testing.assert_array_equal(found.start, at_once.start)
+        np.testing.assert_array_equal(found.stop, at_once.stop)
 
 
 def test_a_triangle_too_large_for_the_device_is_named(context: moderngl.Context) -> None:
