@@ -280,12 +280,15 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
     found = sweep_as_dict(sweep)
     truth = found["truth"]
     click.echo(f"{output}, {picture}: {len(found['frames'])} frames {sweep.settings['frames']}")
-    share = truth["open_share"]
+    left_open = "none is left open"
+    if truth["triangles_open"]:
+        left_open = (
+            f"{truth['triangles_open']} are left open (no disc of {_mm(truth['open_most_m'])} mm)"
+        )
     click.echo(
         f"  truth: {truth['triangles_colliding']} of {truth['triangles_asked']} triangles asked "
-        f"collide, {'-' if share is None else f'{100 * share:.2f}'} % are open below "
-        f"{1e3 * truth['open_at_m']:g} mm; distances from {truth['points']} points, sampled every "
-        f"{_mm(truth['spacing_m'])} mm"
+        f"collide, {left_open}; distances from {truth['points']} points, sampled every "
+        f"{_mm(truth['spacing_m'])} mm (wanted: {_mm(truth['spacing_wanted_m'])})"
     )
     lines = [
         (
@@ -331,7 +334,7 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
         cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
         click.echo("  " + "  ".join(cells).rstrip())
     for engine in found["engines"]:
-        click.echo(f"  {engine['name']}: {_cost_text(engine['cost'])}")
+        click.echo(f"  {engine['name']}: {_cost_text(engine['name'], engine['cost'])}")
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in found["stage_ms_mean"].items())
     click.echo(f"  once a frame, ms mean: {stages}")
 
@@ -345,7 +348,7 @@ def _share(share: float | None) -> str:
     return "-" if share is None else "all" if share == 1.0 else f"{min(100 * share, 99.99):.2f} %"
 
 
-def _cost_text(cost: dict[str, Any] | None) -> str:
+def _cost_text(engine: str, cost: dict[str, Any] | None) -> str:
     if cost is None:
         return "the cost model needs three viewports and an object near the hull"
     text = (
@@ -357,10 +360,12 @@ def _cost_text(cost: dict[str, Any] | None) -> str:
         f"; off by {100 * cost['residual_rms']:.2g} % rms, {100 * cost['residual_most']:.2g} % "
         "at most"
     )
-    if cost["freedom"] == 0:
+    if cost["holds"] is None:
         text += " (as many terms as viewports: that proves nothing)"
-    elif cost["residual_most"] > 0.2:
-        text += ": the paper's model does not hold here, cost follows the surface near the hull"
+    elif not cost["holds"]:
+        text += ": the paper's model does not hold here"
+        if engine in ("native", "compute"):
+            text += ", the engine rejects before it samples"
     if cost["condition"] > 100:
         text += "; fill and read-back grow alike and are hardly told apart"
     return text

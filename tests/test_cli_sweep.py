@@ -1,17 +1,13 @@
 """``hybridve sweep`` as a user runs it, on a ball that comes along and meets a cube."""
 
-import importlib.util
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
 from helpers.sessions import write_ball_session, write_cube_scene
-from helpers.sweeps import certify_by_samples
 
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query import choose
@@ -23,15 +19,6 @@ Run = Callable[..., int]
 
 N_FRAMES = 43
 CENTERS = np.column_stack([np.linspace(-0.9, 0.9, N_FRAMES), np.zeros((N_FRAMES, 2))])
-
-
-@pytest.fixture(autouse=True)
-def _certificates(monkeypatch: pytest.MonkeyPatch) -> None:
-    name = "hybridve.hull.query.certify"
-    if importlib.util.find_spec(name) is None:
-        module = ModuleType(name)
-        monkeypatch.setattr(module, "certify_triangles", certify_by_samples, raising=False)
-        monkeypatch.setitem(sys.modules, name, module)
 
 
 @pytest.fixture(scope="module")

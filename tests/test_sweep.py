@@ -1,6 +1,8 @@
 """The experiment of ``hybridve sweep``: truth, distances, missed triangles, order, cost model."""
 
+import signal
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -274,6 +276,8 @@ def test_engines_and_viewports_take_turns_in_every_repeat() -> None:
         )
         names = [name for name, _ in round_]
         assert names != sorted(names), "one engine after the other"
+    begins = [asked[start][0] for start in range(in_a_round, len(asked), in_a_round)]
+    assert begins == ["a", "b", "a"], "the same engine is always first"
 
 
 def test_every_hull_is_new_to_the_engine_and_every_engine_has_its_thread() -> None:
@@ -345,8 +349,8 @@ def test_an_engine_that_contradicts_a_proof_is_found_out() -> None:
 def test_a_dense_sample_is_a_witness_of_a_triangle_left_open() -> None:
     hull = ball_hull((0.0, 0.0, 0.0))
     (body,) = make_rows([LARGE], (2,), 1.0)[0].bodies
-    left_open = BodyTruth(np.array([OPEN], np.int8), np.zeros((0, 3)))
-    proved = BodyTruth(np.array([FREE], np.int8), np.zeros((0, 3)))
+    left_open = BodyTruth(np.array([OPEN], np.int8), np.zeros((0, 3)), 0.1)
+    proved = BodyTruth(np.array([FREE], np.int8), np.zeros((0, 3)), 0.0)
     dense = dense_mesh(body.triangles, np.array([True]), 0.05)
 
     found = sample_body(hull, left_open, dense, Reference(), 100)
@@ -470,6 +474,7 @@ def test_the_cost_model_recovers_what_made_the_times(
     assert model.residual_most < 1e-8
     np.testing.assert_allclose(model.predicted_s, time_s, rtol=1e-7)
     assert model.freedom == 2
+    assert model.holds
 
 
 def test_times_that_follow_no_pixel_leave_a_residual_and_no_negative_cost() -> None:
@@ -487,6 +492,7 @@ def test_times_that_follow_no_pixel_leave_a_residual_and_no_negative_cost() -> N
     assert model is not None
     assert min(model.fixed_s, model.fill_s_per_px, model.read_back_s_per_px) >= 0
     assert model.residual_most > 0.3
+    assert model.holds is False
     assert model.condition > 100, "fill and read-back grow alike"
 
 
@@ -534,6 +540,32 @@ def test_an_engine_that_does_not_open_leaves_no_thread() -> None:
     with pytest.raises(ReportError, match="no such engine"):
         EngineRoom(fail)
     assert threading.active_count() == before
+
+
+def test_work_in_a_room_ends_when_whoever_asked_is_interrupted() -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    began, went_on_for = time.monotonic(), []
+
+    def work(room: EngineRoom) -> None:
+        try:
+            while time.monotonic() < began + 60:
+                room.raise_if_left()
+                time.sleep(0.001)
+        finally:
+            went_on_for.append(time.monotonic() - began)
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 1.0)
+        with pytest.raises(KeyboardInterrupt), EngineRoom(Reference) as room:
+            room.call(work, room)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+
+    assert len(went_on_for) == 1
+    assert went_on_for[0] < 60
 
 
 @pytest.fixture(scope="module")

@@ -36,6 +36,9 @@ _STORED = {
     "track_times": False,
 }
 
+#: By how much of the time measured the cost model may be off in any row and yet hold.
+_COST_HOLDS = 0.2
+
 Loaded = TypeVar("Loaded")
 
 
@@ -117,7 +120,10 @@ class TruthSettings:
     Attributes
     ----------
     open_at_m : float
-        Collisions smaller than a disc of this diameter may be missing from it.
+        Collisions smaller than a disc of this diameter might be missing from it, as was asked.
+    open_most_m : float
+        The same for the worst of the triangles that were left open, which may be larger where the
+        work was bounded; 0 if none was left open, infinite if nothing is known of one.
     spacing_wanted_m, spacing_m : float
         A quarter of the finest accuracy predicted, and the spacing that was affordable; NaN if
         nothing is near the hull.
@@ -126,6 +132,7 @@ class TruthSettings:
     """
 
     open_at_m: float
+    open_most_m: float
     spacing_wanted_m: float
     spacing_m: float
     points_most: int
@@ -177,6 +184,11 @@ class CostModel:
     read_back_px: NDArray[np.float64]
     predicted_s: NDArray[np.float64]
     residual: NDArray[np.float64]
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether no fitted row is off by more than a fifth; None if any times would be fitted."""
+        return None if self.freedom == 0 else self.residual_most <= _COST_HOLDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -512,6 +524,7 @@ def sweep_as_dict(sweep: Sweep) -> dict[str, Any]:
                 if engine.cost is None
                 else {
                     **{name: getattr(engine.cost, name) for name in _COST_ATTRIBUTES},
+                    "holds": engine.cost.holds,
                     "residual": engine.cost.residual.tolist(),
                     "fitted": engine.cost.fitted.tolist(),
                 },
@@ -534,4 +547,4 @@ def held(engine: EngineSweep, row: int) -> bool | None:
 
 
 def _number(value: Any) -> Any:
-    return None if isinstance(value, float) and math.isnan(value) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -181,10 +181,11 @@ def run_sweep(
     place_s = np.zeros_like(query_s)
     for repeat in range(repeats):
         for number, row in enumerate(rows):
-            for engine, room in enumerate(rooms):
+            for turn in range(len(rooms)):
+                engine = (turn + repeat) % len(rooms)  # none always comes after the same other
                 at = (engine, number, repeat)
-                query_s[at], place_s[at] = room.call(
-                    _answer_in_time, room.engine, frames, row, clock
+                query_s[at], place_s[at] = rooms[engine].call(
+                    _answer_in_time, rooms[engine], frames, row, clock
                 )
                 advance()
 
@@ -266,7 +267,8 @@ def _find_truth(
                         sample_body, frame.hull, one, dense[index], room.engine, TRUTH_POINTS
                     )
             sample_s[number] = time.perf_counter() - started
-    settings = TruthSettings(open_at_m, spacing_wanted_m, spacing_m, TRUTH_POINTS)
+    open_most_m = max((one.open_at_m for frame in found for one in frame.values()), default=0.0)
+    settings = TruthSettings(open_at_m, open_most_m, spacing_wanted_m, spacing_m, TRUTH_POINTS)
     return _Truth(found, settings, certify_s, sample_s, near_triangles)
 
 
@@ -282,15 +284,13 @@ def _judge_all(
     for row in rows:
         known: dict[bytes, NDArray[np.float64]] = {}
         for engine, room in enumerate(rooms):
-            judged[engine].append(
-                room.call(_judge_row, room.engine, frames, row, truth.frames, known)
-            )
+            judged[engine].append(room.call(_judge_row, room, frames, row, truth.frames, known))
             advance()
     return judged
 
 
 def _judge_row(
-    engine: Engine,
+    room: EngineRoom,
     frames: Sequence[HullFrame],
     row: Row,
     truth: list[dict[int, BodyTruth]],
@@ -303,7 +303,7 @@ def _judge_row(
     n_points = triangles_missed = objects_missed = against_proof = 0
     distances_m = [np.zeros(0)]
     for number, frame in enumerate(frames):
-        for index, hits in _answer(engine, frame, row).items():
+        for index, hits in _answer(room, frame, row).items():
             one = truth[number][index]
             n_points += len(hits)
             touched = np.zeros(len(one.verdict), np.bool_)
@@ -312,12 +312,12 @@ def _judge_row(
             against_proof += int((touched & (one.verdict == FREE)).sum())
             if one.collides and len(hits) == 0:
                 objects_missed += 1
+            reported_world = _place(row.bodies[index], hits)  # to warm up, even if it is known
             if len(hits) == 0 or len(one.points_world) == 0:
                 continue
             key = hashlib.sha256(b"%d %d" % (number, index))
             key.update(hits.start.tobytes() + hits.stop.tobytes())
             if key.digest() not in known:
-                reported_world = _place(row.bodies[index], hits)
                 known[key.digest()] = nearest_distances(one.points_world, reported_world)
             distances_m.append(known[key.digest()])
     return _Judgement(
@@ -325,22 +325,23 @@ def _judge_row(
     )
 
 
-def _answer(engine: Engine, frame: HullFrame, row: Row) -> dict[int, Hits]:
+def _answer(room: EngineRoom, frame: HullFrame, row: Row) -> dict[int, Hits]:
     """Return an engine's hits on the bodies that are near."""
+    room.raise_if_left()
     near = np.flatnonzero(frame.near).tolist()
     hull = replace(frame.hull)  # the same arrays, but a hull that no engine has seen
-    hits = engine.query(hull, [row.bodies[index].triangles for index in near])
+    hits = room.engine.query(hull, [row.bodies[index].triangles for index in near])
     return dict(zip(near, hits, strict=True))
 
 
 def _answer_in_time(
-    engine: Engine, frames: Sequence[HullFrame], row: Row, clock: Clock
+    room: EngineRoom, frames: Sequence[HullFrame], row: Row, clock: Clock
 ) -> tuple[float, float]:
     """Return seconds a frame from hull to samples, and from samples to points."""
     query_s = place_s = 0.0
     for frame in frames:
         started = clock()
-        answers = _answer(engine, frame, row)
+        answers = _answer(room, frame, row)
         answered = clock()
         for index, hits in answers.items():
             _place(row.bodies[index], hits)

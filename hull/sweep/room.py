@@ -1,7 +1,8 @@
 """An engine in a thread of its own."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from threading import Event
 from types import TracebackType
 from typing import ParamSpec, Self, TypeVar
 
@@ -30,6 +31,7 @@ class EngineRoom:
 
     def __init__(self, open_engine: Callable[[], Engine]) -> None:
         self._thread = ThreadPoolExecutor(max_workers=1)
+        self._is_left = Event()
         try:
             self.engine = self.call(open_engine)
         except BaseException:
@@ -45,6 +47,11 @@ class EngineRoom:
         """Return what a function returns that is called in the engine's thread."""
         return self._thread.submit(function, *args, **kwargs).result()
 
+    def raise_if_left(self) -> None:
+        """End long work in the engine's thread when whoever asked for it was interrupted."""
+        if self._is_left.is_set():
+            raise CancelledError
+
     def __enter__(self) -> Self:
         return self
 
@@ -55,5 +62,6 @@ class EngineRoom:
         traceback: TracebackType | None,
     ) -> None:
         """Close the engine, where it was opened."""
+        self._is_left.set()
         self.call(self.engine.close)
         self._thread.shutdown()

@@ -44,6 +44,11 @@ class Certificates(Protocol):
         """A point of the triangle inside the hull, (T, 3) metres; NaN unless colliding."""
         ...
 
+    @property
+    def open_at_m(self) -> NDArray[np.float64]:
+        """No disc of this diameter on an open triangle is in the hull, (T,); else NaN."""
+        ...
+
 
 #: Certifies the triangles of a mesh; collisions may go unnoticed below a disc of so many metres.
 Certify = Callable[[Hull, Triangles, float], Certificates]
@@ -59,10 +64,13 @@ class BodyTruth:
         `FREE`, `OPEN` or `COLLIDING`, of every triangle.
     points_world : (N, 3) float64
         Collision points in metres: a witness of each triangle, and dense samples.
+    open_at_m : float
+        No disc of this diameter on a triangle that was left open is in the hull; 0 if none was.
     """
 
     verdict: NDArray[np.int8]
     points_world: NDArray[np.float64]
+    open_at_m: float
 
     @property
     def collides(self) -> bool:
@@ -74,7 +82,11 @@ def certify_body(hull: Hull, body: Body, certify: Certify, open_at_m: float) -> 
     """Return the verdicts on a body's triangles, and the witnesses as its collision points."""
     certificates = certify(hull, body.triangles, open_at_m)
     verdict = np.asarray(certificates.verdict)
-    return BodyTruth(verdict, certificates.witness_world[verdict == COLLIDING])
+    return BodyTruth(
+        verdict,
+        certificates.witness_world[verdict == COLLIDING],
+        float(certificates.open_at_m[verdict == OPEN].max(initial=0.0)),
+    )
 
 
 def longest_edges(mesh: Triangles) -> NDArray[np.float64]:
@@ -140,6 +152,7 @@ def sample_body(
                 _positions(dense, *thinned_samples(hits, points_most)),
             ]
         ),
+        truth.open_at_m,
     )
 
 

@@ -19,6 +19,7 @@ FREE, OPEN, COLLIDING = 0, 1, 2
 class BruteCertificates:
     verdict: NDArray[np.int8]
     witness_world: NDArray[np.float64]
+    open_at_m: NDArray[np.float64]
 
 
 def certify_by_samples(hull: Hull, mesh: Triangles, open_at_m: float) -> BruteCertificates:
@@ -38,4 +39,6 @@ def certify_by_samples(hull: Hull, mesh: Triangles, open_at_m: float) -> BruteCe
     witness_world[colliding] = sample_positions(
         corners[colliding], viewports[colliding], sample[first]
     )
-    return BruteCertificates(verdict, witness_world)
+    # Every disc of twice the spacing's diameter holds a sample.
+    open_m = np.where(verdict == OPEN, 2.0 * edges / np.maximum(viewports - 1, 1), np.nan)
+    return BruteCertificates(verdict, witness_world, open_m)
