@@ -343,6 +343,22 @@ def test_a_mesh_that_moves_is_asked_where_it_is(compute: Compute) -> None:
     assert len(counts) > 4, "it would not show where an earlier place was asked"
 
 
+def test_a_mesh_that_is_still_there_keeps_its_place(compute: Compute) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    first = sphere_mesh(300, 0.15, viewport=6)
+    shifts_m = np.linspace(0.0, 0.3, 5)[:, None] * np.array([1.0, 0.0, 0.0])
+    meshes = [first.moved(first.vertices_world + shift_m) for shift_m in shifts_m]
+    alone = [compute.query(hull, [mesh])[0] for mesh in meshes]
+
+    together = compute.query(hull, meshes)
+
+    for mesh, hits, hits_alone in zip(meshes, together, alone, strict=True):
+        assert_same_samples(hits, hits_alone)
+        (expected,) = Reference().query(hull, [mesh])
+        assert differences(hull.views, mesh, hits, expected, EDGE_BAND_PX).outside_band == []
+    assert len({len(hits) for hits in together}) == len(meshes)
+
+
 def test_other_cameras_see_a_mesh_about_their_own_origin(compute: Compute) -> None:
     mesh = sphere_mesh(300, 0.2, viewport=5)
     here = ring_views()
