@@ -274,6 +274,25 @@ def test_the_size_of_clusters_does_not_matter(
     assert n_triangles < 500 or len(found) > 0
 
 
+def test_work_groups_of_hardware_find_the_same(
+    compute: Compute, context: moderngl.Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few of them, so that each strides over its share of vertices, clusters and items."""
+    monkeypatch.setattr(compute_module, "_SOFTWARE_GROUP_SIZE", compute_module._GROUP_SIZE)
+    monkeypatch.setattr(compute_module, "_SOFTWARE_MAX_GROUPS", 3)
+    hull = ball_hull(ring_views(), np.array([0.3, 0.0, 0.0]), 0.25)
+    meshes = [sphere_mesh(20_000, 0.3), sphere_mesh(300, 0.2, viewport=70)]
+
+    found = compute.query(hull, meshes)
+    with Compute(context) as engine:
+        found_there = engine.query(hull, meshes)
+
+    for hits, hits_there in zip(found, found_there, strict=True):
+        np.testing.assert_array_equal(hits.start, hits_there.start)
+        np.testing.assert_array_equal(hits.stop, hits_there.stop)
+        assert len(hits.start) > 100
+
+
 def test_boxes_hold_their_clusters_and_no_more(compute: Compute) -> None:
     views = ring_views()
     rng = np.random.default_rng(3)
@@ -387,6 +406,13 @@ def test_only_the_vertices_of_a_mesh_that_moves_are_sent_again(compute: Compute)
     assert compute._surfaces[mesh.topology] is surface
     assert compute._placements[mesh].vertices_world is placement.vertices_world
     assert compute._placements[mesh].boxes is placement.boxes
+    assert len(surface.placements) == 1
+    stays, goes = mesh, mesh.moved(mesh.vertices_world + 0.01)
+    compute.query(hull, [stays, goes])
+    del goes
+    for _ in range(2):  # its buffers wait for one query, and are not wanted
+        compute.query(hull, [stays])
+    assert surface.spare == []
     assert len(surface.placements) == 1
 
 

@@ -54,7 +54,9 @@ void main() {
         barrier();
         if (lane < 6u) {
             float least = ends[lane];
-            for (uint other = 1u; other < GROUP; ++other) least = min(least, ends[6u * other + lane]);
+            for (uint other = 1u; other < GROUP; ++other) {
+                least = min(least, ends[6u * other + lane]);
+            }
             boxes[lane * n_clusters + cluster] = lane < 3u ? least : -least;
         }
         barrier();

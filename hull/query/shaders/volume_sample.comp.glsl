@@ -4,8 +4,8 @@
 //
 // One work group per item, a block of at most BLOCK x BLOCK samples of one triangle. First each
 // camera's rectangle around the block is asked (rectangle.glsl), then the samples, in the cameras
-// that stay undecided. Samples inside are bits of the block's rows; the runs of each row are appended
-// to `hits`, in no particular order.
+// that stay undecided. Samples inside are bits of the block's rows; the runs of each row are
+// appended to `hits`, in no particular order.
 // NumPy reference: hull/query/reference.py, contains_points().
 //
 // ## References
@@ -79,8 +79,8 @@ uniform uint mesh;
 
 const float MAX_ERROR_PX = 4e-4;
 
-// The block in space: its first sample and the steps to its neighbours, metres, local frame. Known to
-// the invocations that ask a camera; the others need no double precision.
+// The block in space: its first sample and the steps to its neighbours, metres, local frame. Known
+// to the invocations that ask a camera; the others need no double precision.
 dvec3 position, step_i, step_j;
 vec4 reach_m;   // of its triangle: see pads_of()
 
@@ -146,7 +146,8 @@ uint block_vote(uint c, int reach, int rest) {
         else if (k == 4) d = ivec2(min(reach, rest - near), near);
         vec3 weights = vec3(1.0, d);
         float depth_m = dot(vec3(row_z), weights);
-        widen(extent, vec2(dot(vec3(row_x), weights), dot(vec3(row_y), weights)) / depth_m, depth_m);
+        vec2 pixel = vec2(dot(vec3(row_x), weights), dot(vec3(row_y), weights)) / depth_m;
+        widen(extent, pixel, depth_m);
     }
     vec3 pads = pads_of(c, reach_m);
 
@@ -284,7 +285,9 @@ void main() {
                 uint start = uint(findLSB(bits));
                 uint stop = uint(findLSB(~bits & (0xffffffffu << start)) & 63);  // 63: to the end
                 stop = min(stop, 32u);
-                if (run < hit_capacity) hits[run] = uvec4(triangle, row_start + start, stop - start, mesh);
+                if (run < hit_capacity) {
+                    hits[run] = uvec4(triangle, row_start + start, stop - start, mesh);
+                }
                 bits &= stop == 32u ? 0u : 0xffffffffu << stop;
             }
         }
