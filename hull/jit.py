@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 _logger = logging.getLogger(__name__)
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -36,6 +37,9 @@ def _kept_under() -> Path:
 
 
 numba.config.CACHE_DIR = str(_kept_under())
+
+#: A zero to begin counts with. For one written out, numba compiles what takes it a second time.
+ZERO = cast(int, np.int64(0))
 
 
 def compiled(function: _Function) -> _Function:

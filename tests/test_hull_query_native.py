@@ -15,7 +15,9 @@ from helpers.hulls import (
     sphere_mesh,
 )
 
+from hybridve.hull.query import clusters as clusters_module
 from hybridve.hull.query import native as native_module
+from hybridve.hull.query import rectangles as rectangles_module
 from hybridve.hull.query.bounds import FREE, OPEN, verdicts
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.native import Native
@@ -33,7 +35,7 @@ def test_only_what_rectangles_leave_open_is_sampled(
     verdict = verdicts(hull, mesh.corners_world - views.origin_world)
     asked: list[int] = []
     kept: list[int] = []
-    compiled = native_module.batch_verdicts
+    compiled = rectangles_module._batch_verdicts
 
     def spy(*arguments: Any) -> int:
         n_left = compiled(*arguments)
@@ -43,9 +45,10 @@ def test_only_what_rectangles_leave_open_is_sampled(
 
     engine = Native(1)
     for _ in range(n_queries - 1):
-        engine.query(hull, [mesh])
+        engine.query(ball_hull(views, np.zeros(3), 0.2), [mesh])
     # Run the compiled loop's source, so that it can be listened to.
-    monkeypatch.setattr(native_module, "batch_verdicts", spy)
+    monkeypatch.setattr(rectangles_module, "_batch_verdicts", spy)
+    monkeypatch.setattr(native_module, "survivors", native_module.survivors.py_func)
     monkeypatch.setattr(native_module, "_query", native_module._query.py_func)
     engine.query(hull, [mesh])
 
@@ -86,7 +89,7 @@ def test_a_whole_grid_inside_is_returned_whole() -> None:
 
 @pytest.mark.parametrize("n_threads", [1, 2, 5])
 def test_threads_do_not_change_the_result(n_threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native_module, "_SHARE_TRIANGLES", 37)
+    monkeypatch.setattr(clusters_module, "_SHARE_TRIANGLES", 37)
     hull = ball_hull(ring_views(), np.array([0.4, 0.0, 0.0]), 0.2)
     meshes = [sphere_mesh(2000), sphere_mesh(100, 0.4), sphere_mesh(500, 0.1)]
 
@@ -103,7 +106,7 @@ def test_an_error_in_a_thread_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
         raise MemoryError
 
     monkeypatch.setattr(native_module, "_query", fail)
-    monkeypatch.setattr(native_module, "_SHARE_TRIANGLES", 10)
+    monkeypatch.setattr(clusters_module, "_SHARE_TRIANGLES", 10)
     hull = ball_hull(ring_views(), np.zeros(3), 0.2)
 
     with Native(2) as engine, pytest.raises(MemoryError):
@@ -147,8 +150,9 @@ def test_the_same_mesh_serves_other_cameras() -> None:
 
 def test_what_is_kept_of_a_mesh_goes_with_it() -> None:
     hull = ball_hull(ring_views(), np.zeros(3), 0.2)
-    engine = Native(1)
+    others = set(clusters_module._prepared)
     kept = sphere_mesh(100)
-    engine.query(hull, [kept, sphere_mesh(200)])
 
-    assert list(engine._prepared) == [kept]
+    Native(1).query(hull, [kept, sphere_mesh(200)])
+
+    assert set(clusters_module._prepared) - others == {kept}

@@ -93,7 +93,9 @@ def rectangle_pads(
     return np.stack([pad_x, pad_y, near_m], axis=-1)
 
 
-def verdicts(hull: Hull, corners_local: NDArray[np.float64]) -> NDArray[np.int8]:
+def verdicts(
+    hull: Hull, corners_local: NDArray[np.float64], roundoff: float = ROUNDOFF_FLOAT64
+) -> NDArray[np.int8]:
     """Return what the rectangles prove of sets of points.
 
     Parameters
@@ -102,6 +104,8 @@ def verdicts(hull: Hull, corners_local: NDArray[np.float64]) -> NDArray[np.int8]
         The visual hull of one frame.
     corners_local : (N, K, 3) float64
         The K corners of a convex hull around each set, in metres in the local frame of the views.
+    roundoff : float
+        Unit roundoff to allow for.
 
     Returns
     -------
@@ -111,14 +115,17 @@ def verdicts(hull: Hull, corners_local: NDArray[np.float64]) -> NDArray[np.int8]
     result = np.zeros(len(corners_local), np.int8)
     step = max(1, _CHUNK // max(1, corners_local.shape[1] * len(hull.views)))
     for start in range(0, len(corners_local), step):
-        result[start : start + step] = _chunk_verdicts(hull, corners_local[start : start + step])
+        chunk = corners_local[start : start + step]
+        result[start : start + step] = _chunk_verdicts(hull, chunk, roundoff)
     return result
 
 
-def _chunk_verdicts(hull: Hull, corners_local: NDArray[np.float64]) -> NDArray[np.int8]:
+def _chunk_verdicts(
+    hull: Hull, corners_local: NDArray[np.float64], roundoff: float
+) -> NDArray[np.int8]:
     views = hull.views
     sizes_px = views.sizes_px
-    pads = rectangle_pads(views, np.abs(corners_local).max(axis=1), ROUNDOFF_FLOAT64)  # (N, C, 4)
+    pads = rectangle_pads(views, np.abs(corners_local).max(axis=1), roundoff)  # (N, C, 4)
     near_m = pads[..., 2]
 
     projected = (

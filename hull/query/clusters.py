@@ -6,20 +6,41 @@ holds for every cluster and group of clusters the rectangle it projects into, in
 Nothing in it depends on the silhouettes: it serves as long as mesh and cameras stand still.
 """
 
-from collections.abc import Callable
-from typing import Any
+import itertools
+import weakref
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.query.rectangles import BRANCH, CLUSTER, Frame, Surface, Tree, cluster_rectangles
-from hybridve.hull.query.silhouettes import Views
+from hybridve.hull.jit import compiled
+from hybridve.hull.query.bounds import ROUNDOFF_FLOAT64, rectangle_pads
+from hybridve.hull.query.engine import Triangles
+from hybridve.hull.query.rectangles import (
+    BATCH,
+    BRANCH,
+    CLUSTER,
+    Frame,
+    Surface,
+    Tree,
+    cluster_rectangles,
+    open_nodes,
+)
+from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.query.threads import Threads
 
 #: Bits per axis of a place on the space-filling curve: three times 21 fill an integer.
 _CURVE_BITS = 21
 
 #: What stands for the tree of a mesh that has none.
-NO_TREE = Tree(np.zeros((0, 0, 4), np.int32), np.zeros(0, np.int64), np.zeros(0, np.int64))
+NO_TREE = Tree(np.zeros((0, 0, 4), np.int32), np.zeros(0, np.int64))
+
+#: Triangles of a share at least: a call costs some microseconds.
+_SHARE_TRIANGLES = 2048
+
+#: Meshes of fewer triangles are asked one triangle after the other: clusters do not pay.
+_TREE_TRIANGLES = 2048
 
 #: Levels end where this few nodes are left.
 _TOP_NODES = 8
@@ -54,7 +75,7 @@ def spatial_order(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> ND
     """
     if len(faces) == 0:
         return np.zeros(0, np.int64)
-    centroids = sum(vertices[faces[:, corner]] for corner in range(3)) / 3.0
+    centroids = vertices[faces].mean(axis=1)
     lower = centroids.min(axis=0)
     edge = float((centroids.max(axis=0) - lower).max())
     cells = 2**_CURVE_BITS - 1
@@ -78,43 +99,132 @@ def _spread(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return number
 
 
-def make_tree(
-    views: Views,
-    surface: Surface,
-    run: Callable[[Callable[..., None], list[tuple[Any, ...]]], None],
-) -> Tree:
-    """Return the clusters of a mesh as these cameras see them.
+def make_frame(hull: Hull) -> Frame:
+    """Return a hull as compiled loops take it.
 
-    Parameters
-    ----------
-    views : Views
-        C cameras.
-    surface : Surface
-        The mesh, pads in the order of the views.
-    run : callable
-        Runs a function with each of some arguments, in whatever threads there are.
+    The camera that sees the smallest silhouette rejects most: it is asked first.
     """
-    n_cameras = len(views)
-    nothing = np.zeros(0, np.int64)
-    frame = Frame(
-        views.img_from_local.reshape(-1, 12),
-        views.sizes_px,
-        np.zeros(0, np.uint8),
-        nothing,
-        np.zeros(0, np.int32),
-        nothing,
+    views = hull.views
+    ends = hull.integral_offset + (views.sizes_px + 1).prod(axis=1) - 1
+    order = np.argsort(hull.integrals_flat[ends] / views.sizes_px.prod(axis=1), kind="stable")
+    return Frame(
+        views.img_from_local.reshape(-1, 12)[order],
+        views.sizes_px[order],
+        _read_only(hull.masks_flat),
+        hull.mask_offset[order],
+        _read_only(hull.integrals_flat),
+        hull.integral_offset[order],
+        order,
         views.unseen == "keep",
         views.min_cameras,
     )
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a view that cannot be written to, so that one compiled version takes every array."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+class Share(NamedTuple):
+    """A part of a mesh for one call of compiled code; see `rectangles.survivors`."""
+
+    nodes: NDArray[np.int64]
+    level: int
+    tree: Tree
+    surface: Surface
+
+
+@dataclass(slots=True, eq=False)
+class _Prepared:
+    """What is derived from a mesh as long as it and the cameras stay the same."""
+
+    views: Views
+    surface: Surface
+    tree: Tree | None
+    first_hull: Hull | None  # that was asked about it; None once there is a tree
+
+
+#: Kept as long as the mesh lives.
+_prepared: weakref.WeakKeyDictionary[Triangles, _Prepared] = weakref.WeakKeyDictionary()
+
+
+def make_shares(
+    hull: Hull, frame: Frame, mesh: Triangles, threads: Threads, *, reject: bool = True
+) -> list[Share]:
+    """Return shares of the work that together cover a mesh, in the order of its triangles.
+
+    The tree of clusters is made when a second frame asks about a mesh: one that moves in every
+    frame would pay for it and never use it.
+
+    Parameters
+    ----------
+    hull, frame
+        The frame.
+    mesh : Triangles
+        The mesh.
+    threads : Threads
+        Who will do the work, and makes the tree.
+    reject : bool
+        Whether rectangles may prove anything.
+    """
+    if len(mesh) == 0:
+        return []
+    prepared = _prepared.get(mesh)
+    if prepared is None or prepared.views is not hull.views:
+        vertices_local, reach_m = _localized(mesh.vertices_world, hull.views.origin_world)
+        pads = rectangle_pads(hull.views, reach_m, ROUNDOFF_FLOAT64)
+        prepared = _Prepared(hull.views, Surface(vertices_local, mesh.faces, pads), None, hull)
+        _prepared[mesh] = prepared
+    is_static = prepared.first_hull is not hull
+    if prepared.tree is None and is_static and reject and len(mesh) >= _TREE_TRIANGLES:
+        prepared.tree = _make_tree(prepared.views, prepared.surface, threads)
+        prepared.first_hull = None
+    pads = prepared.surface.pads[frame.order]
+    # Rectangles that are widened without end prove nothing.
+    surface = prepared.surface._replace(pads=pads if reject else np.full_like(pads, np.inf))
+    if prepared.tree is None or not reject:
+        tree, level = NO_TREE, 0
+        nodes = np.arange(-(-len(mesh) // BATCH))
+        n_shares = min(threads.n_shares, -(-len(mesh) // _SHARE_TRIANGLES))
+    else:
+        tree = prepared.tree
+        level = len(tree.level_start) - 2
+        while level > 0 and CLUSTER * BRANCH**level > _SHARE_TRIANGLES:
+            level -= 1
+        nodes = open_nodes(level, tree, frame)
+        n_shares = min(threads.n_shares, len(nodes))
+    cuts = np.linspace(0, len(nodes), n_shares + 1).astype(np.int64).tolist()
+    return [Share(nodes[a:b], level, tree, surface) for a, b in itertools.pairwise(cuts)]
+
+
+@compiled
+def _localized(
+    vertices_world: NDArray[np.float64], origin_world: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return vertices (V, 3) about an origin, and their largest absolute coordinates (3,)."""
+    vertices_local, reach_m = np.zeros_like(vertices_world), np.zeros(3)
+    for vertex in range(len(vertices_world)):
+        for axis in range(3):
+            coordinate = vertices_world[vertex, axis] - origin_world[axis]
+            vertices_local[vertex, axis] = coordinate
+            reach_m[axis] = max(reach_m[axis], abs(coordinate))
+    return vertices_local, reach_m
+
+
+def _make_tree(views: Views, surface: Surface, threads: Threads) -> Tree:
+    """Return the clusters of a mesh as these cameras see them; pads in the order of the views."""
+    n_cameras = len(views)
     n_clusters = -(-len(surface.faces) // CLUSTER)
     clusters = np.zeros((n_clusters, n_cameras, 4), np.int32)
-    share = max(64, n_clusters // 16)
-    run(
-        cluster_rectangles,
+    matrices = views.img_from_local.reshape(-1, 12)
+    cuts = np.linspace(0, n_clusters, min(threads.n_shares, n_clusters) + 1).astype(np.int64)
+    threads.run(
         [
-            (start, min(start + share, n_clusters), surface, frame, clusters)
-            for start in range(0, n_clusters, share)
-        ],
+            (cluster_rectangles, (a, b, surface, matrices, views.sizes_px, clusters))
+            for a, b in itertools.pairwise(cuts.tolist())
+        ]
     )
     levels = [clusters]
     while len(levels[-1]) > _TOP_NODES:
@@ -123,5 +233,4 @@ def make_tree(
         above = np.maximum.reduceat(below, starts, axis=0)
         above[..., 0::2] = np.minimum.reduceat(below[..., 0::2], starts, axis=0)
         levels.append(above)
-    level_start = np.cumsum([0, *map(len, levels)]).astype(np.int64)
-    return Tree(np.concatenate(levels), level_start, np.arange(n_cameras))
+    return Tree(np.concatenate(levels), np.cumsum([0, *map(len, levels)]).astype(np.int64))

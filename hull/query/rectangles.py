@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.jit import compiled
+from hybridve.hull.jit import ZERO, compiled
 
 #: What one camera's rectangle proves: no sample inside, all on object pixels, none seen, nothing.
 REJECTS, ACCEPTS, ABSTAINS, UNDECIDED = 0, 1, 2, 3
@@ -38,6 +38,8 @@ class Frame(NamedTuple):
         Width and height.
     masks, mask_offset, integrals, integral_offset
         As in `hybridve.hull.query.silhouettes.Hull`.
+    order : (C,) int64
+        The number of each camera in the views.
     keep : bool
         Whether a camera that cannot see a point abstains.
     min_cameras : int
@@ -50,6 +52,7 @@ class Frame(NamedTuple):
     mask_offset: NDArray[np.int64]
     integrals: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
+    order: NDArray[np.int64]
     keep: bool
     min_cameras: int
 
@@ -82,13 +85,10 @@ class Tree(NamedTuple):
         -1..size; cameras in the order of the views. Level after level, clusters first.
     level_start : (L + 1,) int64
         Where each level starts in `rectangles`.
-    order : (C,) int64
-        The cameras in the order of the frame.
     """
 
     rectangles: NDArray[np.int32]
     level_start: NDArray[np.int64]
-    order: NDArray[np.int64]
 
 
 @compiled
@@ -195,7 +195,12 @@ def load_corners(
 
 @compiled
 def cluster_rectangles(
-    first: int, last: int, surface: Surface, frame: Frame, rectangles: NDArray[np.int32]
+    first: int,
+    last: int,
+    surface: Surface,
+    matrices: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    rectangles: NDArray[np.int32],
 ) -> None:
     """Write the rectangles (clusters, C, 4) of clusters first..last: the union of their triangles'.
 
@@ -209,13 +214,13 @@ def cluster_rectangles(
         start = cluster * CLUSTER
         n_triangles = min(CLUSTER, len(surface.faces) - start)
         load_corners(start, n_triangles, surface.vertices_local, surface.faces, corners)
-        for camera in range(len(frame.matrices)):
+        for camera in range(len(matrices)):
             triangle_rectangles(
                 n_triangles,
                 corners,
-                frame.matrices[camera],
-                frame.sizes[camera, 0],
-                frame.sizes[camera, 1],
+                matrices[camera],
+                sizes[camera, 0],
+                sizes[camera, 1],
                 surface.pads[camera],
                 parts,
             )
@@ -229,8 +234,27 @@ def cluster_rectangles(
             rectangles[cluster, camera, 3] = y1
 
 
+class Survivors(NamedTuple):
+    """The triangles that are not proved free, in ranges, ascending.
+
+    Attributes
+    ----------
+    start, stop : (K,) int64
+        Triangles; several only where all their points are inside the hull.
+    n_accept : (K,) int64
+        How many cameras see nothing but object pixels of them.
+    is_open : (K, C) bool
+        Which cameras, in the frame's order, are undecided. None: all their points are inside.
+    """
+
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+    n_accept: NDArray[np.int64]
+    is_open: NDArray[np.bool_]
+
+
 @compiled
-def node_verdict(
+def _node_verdict(
     rectangles: NDArray[np.int32],
     order: NDArray[np.int64],
     sizes: NDArray[np.int64],
@@ -254,7 +278,7 @@ def node_verdict(
     is_free : bool
         Whether no sample of the node can be inside.
     """
-    n_left = 0
+    n_left = ZERO
     for number in range(n_cameras):
         camera = cameras[number]
         place = order[camera]
@@ -270,7 +294,7 @@ def node_verdict(
             keep,
         )
         if vote == REJECTS:
-            return 0, 0, True
+            return n_left, n_accept, True
         if vote == ACCEPTS:
             n_accept += 1
         elif vote == UNDECIDED:
@@ -280,7 +304,49 @@ def node_verdict(
 
 
 @compiled
-def batch_verdicts(
+def open_nodes(level: int, tree: Tree, frame: Frame) -> NDArray[np.int64]:
+    """Return the nodes of a level that are not proved free, counted within it, ascending."""
+    n_cameras = len(frame.matrices)
+    cameras, left = np.arange(n_cameras), np.zeros(n_cameras, np.int64)
+    top = len(tree.level_start) - 2
+    nodes = np.arange(tree.level_start[top], tree.level_start[top + 1])
+    for height in range(top, level - 1, -1):
+        n_kept = 0
+        for number in range(len(nodes)):
+            _, _, is_free = _node_verdict(
+                tree.rectangles[nodes[number]],
+                frame.order,
+                frame.sizes,
+                frame.integrals,
+                frame.integral_offset,
+                frame.keep,
+                frame.min_cameras,
+                cameras,
+                n_cameras,
+                ZERO,
+                left,
+            )
+            if not is_free:
+                nodes[n_kept] = nodes[number]
+                n_kept += 1
+        nodes = nodes[:n_kept]
+        if height > level:
+            below = np.zeros(BRANCH * n_kept, np.int64)
+            n_below = 0
+            for number in range(n_kept):
+                first = BRANCH * (nodes[number] - tree.level_start[height])
+                size = tree.level_start[height] - tree.level_start[height - 1]
+                for child in range(first, min(first + BRANCH, size)):
+                    below[n_below] = tree.level_start[height - 1] + child
+                    n_below += 1
+            nodes = below[:n_below]
+    for number in range(len(nodes)):
+        nodes[number] -= tree.level_start[level]
+    return nodes
+
+
+@compiled
+def _batch_verdicts(
     start: int,
     n_triangles: int,
     surface: Surface,
@@ -307,7 +373,7 @@ def batch_verdicts(
     accepted : (n,) int64
         Written: how many cameras see nothing but object pixels of each.
     is_open : (n, C) bool
-        Written: which cameras are undecided about it. None: all its samples are inside.
+        Written: which cameras are undecided about it.
     """
     load_corners(start, n_triangles, surface.vertices_local, surface.faces, corners)
     integrals, keep = frame.integrals, frame.keep
@@ -353,8 +419,117 @@ def batch_verdicts(
                 corners[k, n_kept] = corners[k, i]
             n_kept += 1
         n_left = n_kept
-    if n_cameras == 0:
-        for i in range(n_triangles):
-            for other in range(all_cameras):
-                is_open[i, other] = False
     return n_left
+
+
+@compiled
+def survivors(
+    nodes: NDArray[np.int64], level: int, tree: Tree, surface: Surface, frame: Frame
+) -> Survivors:
+    """Return the triangles of some nodes of a level of the tree that are not proved free.
+
+    Without a tree (no levels), `nodes` are batches of triangles, asked one by one.
+    """
+    n_cameras, n_triangles = len(frame.matrices), len(surface.faces)
+    has_tree = len(tree.level_start) > 0
+    rectangles, order = tree.rectangles, frame.order
+    sizes, integrals, integral_offset = frame.sizes, frame.integrals, frame.integral_offset
+    # Row h + 1: the cameras that leave a node of level h's parent open, and how many others accept.
+    cameras = np.zeros((level + 2, n_cameras), np.int64)
+    for row in range(level + 2):
+        for camera in range(n_cameras):
+            cameras[row, camera] = camera
+    n_open, n_accept = np.zeros(level + 2, np.int64), np.zeros(level + 2, np.int64)
+    n_open[level + 1] = n_cameras
+    stack = np.zeros(((level + 1) * BRANCH + 1, 2), np.int64)  # node within its level, level
+    corners, parts = np.zeros((9, BATCH)), np.zeros((4, BATCH), np.int32)
+    triangle, accepted = np.zeros(BATCH, np.int64), np.zeros(BATCH, np.int64)
+    is_open = np.zeros((BATCH, n_cameras), np.bool_)
+
+    capacity = 4 * BATCH
+    found = Survivors(
+        np.zeros(capacity, np.int64),
+        np.zeros(capacity, np.int64),
+        np.zeros(capacity, np.int64),
+        np.zeros((capacity, n_cameras), np.bool_),
+    )
+    n = 0
+    for number in range(len(nodes)):
+        stack[0, 0], stack[0, 1] = nodes[number], level
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            place, height = stack[depth, 0], stack[depth, 1]
+            size, n_left, n_accepted = BATCH, n_cameras, ZERO
+            if has_tree:
+                n_left, n_accepted, is_free = _node_verdict(
+                    rectangles[tree.level_start[height] + place],
+                    order,
+                    sizes,
+                    integrals,
+                    integral_offset,
+                    frame.keep,
+                    frame.min_cameras,
+                    cameras[height + 1],
+                    n_open[height + 1],
+                    n_accept[height + 1],
+                    cameras[height],
+                )
+                if is_free:
+                    continue
+                size = CLUSTER * BRANCH**height
+            first = place * size
+            last = min(first + size, n_triangles)
+            if n + BATCH > len(found.start):
+                found = _longer(found, n)
+            if n_left == 0:
+                found.start[n], found.stop[n], found.n_accept[n] = first, last, n_accepted
+                for camera in range(n_cameras):
+                    found.is_open[n, camera] = False
+                n += 1
+            elif height == 0:
+                n_kept = _batch_verdicts(
+                    first,
+                    last - first,
+                    surface,
+                    frame,
+                    cameras[0],
+                    n_left,
+                    n_accepted,
+                    corners,
+                    parts,
+                    triangle,
+                    accepted,
+                    is_open,
+                )
+                for kept in range(n_kept):
+                    found.start[n], found.stop[n] = triangle[kept], triangle[kept] + 1
+                    found.n_accept[n] = accepted[kept]
+                    for camera in range(n_cameras):
+                        found.is_open[n, camera] = is_open[kept, camera]
+                    n += 1
+            else:
+                n_open[height], n_accept[height] = n_left, n_accepted
+                below = tree.level_start[height] - tree.level_start[height - 1]
+                for child in range(min((place + 1) * BRANCH, below) - 1, place * BRANCH - 1, -1):
+                    stack[depth, 0], stack[depth, 1] = child, height - 1
+                    depth += 1
+    return Survivors(found.start[:n], found.stop[:n], found.n_accept[:n], found.is_open[:n])
+
+
+@compiled
+def _longer(found: Survivors, n: int) -> Survivors:
+    """Return twice the room that begins as `found` does."""
+    capacity, n_cameras = 2 * len(found.start), found.is_open.shape[1]
+    longer = Survivors(
+        np.zeros(capacity, np.int64),
+        np.zeros(capacity, np.int64),
+        np.zeros(capacity, np.int64),
+        np.zeros((capacity, n_cameras), np.bool_),
+    )
+    for k in range(n):
+        longer.start[k], longer.stop[k] = found.start[k], found.stop[k]
+        longer.n_accept[k] = found.n_accept[k]
+        for camera in range(n_cameras):
+            longer.is_open[k, camera] = found.is_open[k, camera]
+    return longer
