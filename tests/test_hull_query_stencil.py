@@ -29,6 +29,7 @@ from hybridve.hull.query import stencil as stencil_module
 from hybridve.hull.query.choose import open_engine
 from hybridve.hull.query.device import open_device
 from hybridve.hull.query.engine import Triangles
+from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 from hybridve.hull.query.stencil import Stencil
@@ -36,6 +37,7 @@ from hybridve.hull.query.stencil import Stencil
 pytestmark = pytest.mark.gl
 
 reference = Reference()
+native = Native(n_threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -331,6 +333,51 @@ def test_a_large_image_is_sampled_to_a_thousandth_of_a_pixel(
         assert share_in_double == 0.0
 
 
+def test_triangles_of_ten_thousands_of_pixels_are_sampled_as_precisely(stencil: Stencil) -> None:
+    """Their first sample lies far outside the image, and single precision would not do."""
+    rng = np.random.default_rng(3)
+    views = large_views(rng)
+    hull = make_hull(views, [rng.integers(0, 5, (1200, 1600)).astype(np.uint8) for _ in range(4)])
+    middle = rng.normal(size=(30, 1, 3)) * 0.2
+    spread = rng.normal(size=(30, 1, 3)) * np.array([-40.0, 1.0, 1.0])[:, None]
+    corners = middle + spread + rng.normal(size=(30, 3, 3)) * 0.5
+    for camera in range(4):
+        view = Views(
+            ("cam",),
+            views.sizes_px[:1],
+            views.img_from_local[camera : camera + 1],
+            views.origin_world,
+        )
+        of_one = make_hull(view, [hull.mask(camera)])
+        mesh = soup(view, corners, np.full(len(corners), 500, np.int32))
+
+        (found,), (expected,) = stencil.query(of_one, [mesh]), native.query(of_one, [mesh])
+
+        assert differences(view, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+        assert len(expected) > 10_000, "the test would prove too little"
+
+
+def test_a_tile_whose_far_corner_lies_behind_the_camera_is_carved_there(
+    clean: moderngl.Context,
+) -> None:
+    """Its three corners on the edges lie in front; only the fourth, on the diagonal, does not."""
+    pose = np.column_stack([np.eye(3), np.zeros(3)])
+    view = Views(
+        ("cam",), np.array([[400, 400]]), projection(pose, 50.0, 400, 400)[None], np.zeros(3)
+    )
+    hull = full_hull(view)
+    rng = np.random.default_rng(0)
+    corners = rng.uniform(-0.3, 0.3, (20, 3, 3))
+    corners[:, :, 2] = [1.0, -0.3, -0.3]
+    mesh = soup(view, corners, np.full(20, 100, np.int32))
+    with Stencil(clean, window_px=64) as engine:
+        (found,) = engine.query(hull, [mesh])
+
+    (expected,) = reference.query(hull, [mesh])
+    assert differences(view, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+    assert 0 < len(expected) < 20 * 5050
+
+
 def test_what_belonged_to_a_mesh_leaves_the_device_with_it(stencil: Stencil) -> None:
     hull = ball_hull(ring_views(), np.zeros(3), 0.2)
     kept = sphere_mesh(100)
@@ -343,7 +390,9 @@ def test_what_belonged_to_a_mesh_leaves_the_device_with_it(stencil: Stencil) -> 
     assert list(stencil._layouts) == [kept.topology]
 
 
-def test_what_others_draw_is_not_blended(context: moderngl.Context, stencil: Stencil) -> None:
+def test_what_others_draw_is_blended_as_they_say(
+    context: moderngl.Context, stencil: Stencil
+) -> None:
     target = context.framebuffer([context.texture((1, 1), 1)])
     target.use()
     program = context.program(
@@ -360,6 +409,11 @@ def test_what_others_draw_is_not_blended(context: moderngl.Context, stencil: Ste
     for _ in range(2):
         vertices.render(moderngl.POINTS, vertices=1)
     assert target.read(components=1, alignment=1) == bytes([51])
+    target.clear()
+    context.enable(moderngl.BLEND)  # and what is blended on purpose is blended as OpenGL begins
+    vertices.render(moderngl.POINTS, vertices=1)
+    context.disable(moderngl.BLEND)
+    assert abs(target.read(components=1, alignment=1)[0] - 25.5) < 1.0
 
 
 def test_a_window_that_the_device_does_not_draw_is_refused(clean: moderngl.Context) -> None:

@@ -40,8 +40,9 @@
 //     u ((N / w) (9 + 4 W / w) + 3).
 //
 // Where that bound (taken with 12 and 6) exceeds MAX_ERROR_PX, some 700 px of extent, or where the
-// cell is not safely in front of the camera, the cell is left to the same program compiled with
-// PRECISE, which projects every fragment in float64. hull/query/stencil.py decides by the same
+// cell is not safely in front of the camera (MIN_DEPTH_M), or where the depth varies so much that
+// rounding might turn a denominator's sign (MAX_SWELL bounds W / w), the cell is left to the same
+// program compiled with PRECISE, which projects every fragment in float64. hull/query/stencil.py decides by the same
 // bound, a hair stricter, whether that program must run at all.
 
 // INSERT
