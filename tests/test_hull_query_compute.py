@@ -164,7 +164,7 @@ def test_a_cluster_seen_on_edge_beside_a_pixel_edge_is_not_rejected(
     rng = np.random.default_rng(4)
     column = 801
     for _ in range(20):
-        camera_local = rng.uniform(20.0, 60.0, 3)
+        camera_local = rng.uniform(60.0, 100.0, 3)  # farther: all corners must fall to one side
         matrix = np.array(
             [[1700.0, 0.0, column + inside_px], [0.0, 1700.0, 600.0], [0.0, 0.0, 1.0]]
         )
@@ -173,7 +173,7 @@ def test_a_cluster_seen_on_edge_beside_a_pixel_edge_is_not_rejected(
         mask = np.zeros((1200, 1600), np.uint8)
         mask[:, column] = 1
         n_triangles = compute_module._CLUSTER
-        around = np.array([0.0, 0.0, rng.uniform(1.0, 8.0)])
+        around = np.array([0.0, 0.0, rng.uniform(0.4, 1.0)])
         corners = around + rng.uniform(-0.05, 0.05, (n_triangles, 3, 3)) * (0.0, 1.0, 1.0)
         mesh = soup(views, corners + camera_local, np.full(n_triangles, 10, np.int32))
 
