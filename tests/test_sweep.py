@@ -1,5 +1,6 @@
 """The experiment of ``hybridve sweep``: truth, distances, missed triangles, order, cost model."""
 
+import json
 import signal
 import threading
 import time
@@ -12,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.sessions import BALL_RADIUS_M, SIZE_PX, ball_mask, ring_matrix
-from helpers.sweeps import FREE, OPEN, certify_by_samples
+from helpers.sweeps import COLLIDING, FREE, OPEN, BruteCertificates, certify_by_samples
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -96,11 +97,10 @@ def sweep_of(
             frames_of(objects, hulls),
             make_rows(objects, viewports, accuracy_m),
             rooms,
-            certify=certify_by_samples,
             open_at_m=0.01,
             truth_room=truth_room,
             repeats=repeats,
-            **others,
+            **{"certify": certify_by_samples, **others},
         )
     for room in rooms:
         room.__exit__(None, None, None)
@@ -142,7 +142,8 @@ def test_inside_the_hull_the_largest_distance_is_half_the_one_predicted() -> Non
     np.testing.assert_array_equal(outcome.rows.predicted_m, outcome.rows.predicted_near_m)
     assert engine.within_predicted.tolist() == [1.0] * 5
     assert engine.points[:4].tolist() == [3, 6, 15, 45]
-    assert outcome.truth.spacing_m == outcome.truth.spacing_wanted_m
+    finest_m = outcome.rows.predicted_m.min()
+    assert outcome.truth.spacing_m == outcome.truth.spacing_wanted_m == finest_m / 4
 
 
 @pytest.mark.parametrize("viewport", [3, 6])
@@ -361,6 +362,56 @@ def test_a_dense_sample_is_a_witness_of_a_triangle_left_open() -> None:
     assert not sample_body(hull, proved, dense, Reference(), 100).collides
 
 
+def test_every_triangle_that_a_dense_sample_convicts_keeps_a_point() -> None:
+    hull = ball_hull((0.0, 0.0, 0.0))
+    (body,) = make_rows([box(0.05)], (2,), 1.0)[0].bodies  # wholly inside the ball
+    left_open = BodyTruth(np.full(12, OPEN, np.int8), np.zeros((0, 3)), 0.1)
+    dense = dense_mesh(body.triangles, np.ones(12, np.bool_), 0.05)
+
+    found = sample_body(hull, left_open, dense, Reference(), 1)
+
+    assert (found.verdict == COLLIDING).all()
+    assert len(found.points_world) == 12 + 1
+
+
+def test_without_certificates_the_dense_samples_alone_make_the_truth() -> None:
+    def certify_nothing(hull: Hull, mesh: Triangles, open_at_m: float) -> BruteCertificates:
+        n = len(mesh)
+        unknown = np.full((n, 3), np.nan)
+        return BruteCertificates(np.full(n, OPEN, np.int8), unknown, np.full(n, np.inf))
+
+    objects, hulls = [box(0.1)], [ball_hull((0.22, 0.0, 0.03))]
+
+    blind = sweep_of(objects, hulls, (2, 9), certify=certify_nothing)
+    seeing = sweep_of(objects, hulls, (2, 9))
+
+    np.testing.assert_array_equal(
+        blind.frames.triangles_colliding, seeing.frames.triangles_colliding
+    )
+    assert 0 < blind.frames.triangles_colliding[0] < 12
+    assert blind.frames.triangles_open[0] == 12 - blind.frames.triangles_colliding[0]
+    assert blind.truth.open_most_m == np.inf
+    assert seeing.truth.open_most_m < np.inf
+    np.testing.assert_array_equal(
+        blind.engines[0].triangles_missed, seeing.engines[0].triangles_missed
+    )
+    found = (blind.rows, blind.frames, blind.truth, blind.engines)
+    json.dumps(sweep_as_dict(Sweep("", "", "", {}, {}, N_CAMERAS, *found)), allow_nan=False)
+
+
+def test_frames_with_the_same_answer_are_each_measured_by_their_own_truth() -> None:
+    # Both balls swallow the one sample at the corner, the second reaches farther from it.
+    corner = thing([(0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.5, 0.0)])
+    near, far = ball_hull((0.0, 0.0, 0.0)), ball_hull((0.08, 0.08, 0.0))
+
+    alone = [sweep_of([corner], [hull], (2,), accuracy_m=1.0).engines[0] for hull in (near, far)]
+    together = sweep_of([corner], [near, far], (2,), accuracy_m=1.0).engines[0]
+
+    assert [engine.points[0] for engine in alone] == [1, 1]
+    assert alone[1].distance_max_m[0] > alone[0].distance_max_m[0] + 0.05
+    assert together.distance_max_m[0] == alone[1].distance_max_m[0]
+
+
 @given(
     viewports=st.lists(st.integers(1, 5), min_size=1, max_size=8),
     seed=st.integers(0, 2**32 - 1),
@@ -452,9 +503,10 @@ def test_the_cost_model_recovers_what_made_the_times(
     fill_px = 4 * 300 * viewport**2 / 2
     read_back_px = np.array([10.0, 5000.0, 900.0, 70_000.0, 50_000.0, 8.0])
     time_s = fixed_s + fill_s * fill_px + read_s * read_back_px
+    measured_s = time_s * np.array([1, 1, 1, 1, 1, 2])  # the last follows another law
 
     model = fit_cost(
-        time_s,
+        measured_s,
         transforms=1200.0,
         fill_px=fill_px,
         read_back_px=read_back_px,
@@ -472,7 +524,9 @@ def test_the_cost_model_recovers_what_made_the_times(
         assert abs(found - true) * (count / time_s[:5]).max() < 1e-8
     assert model.transform_most_s == model.fixed_s / 1200.0
     assert model.residual_most < 1e-8
+    assert model.residual_rms < 1e-8
     np.testing.assert_allclose(model.predicted_s, time_s, rtol=1e-7)
+    assert model.residual[5] == pytest.approx(-0.5)
     assert model.freedom == 2
     assert model.holds
 
@@ -586,6 +640,15 @@ def some_sweep() -> Sweep:
         truth=outcome.truth,
         engines=(first, replace(second, name="without a model", cost=None)),
     )
+
+
+def test_the_median_and_the_spread_are_those_of_the_repeats(some_sweep: Sweep) -> None:
+    query_s = np.array([[5.0, 1.0, 4.0, 2.0, 3.0]])
+    engine = replace(some_sweep.engines[0], query_s=query_s, place_s=np.full((1, 5), 10.0))
+
+    assert engine.time_s.tolist() == (query_s + 10.0).tolist()
+    assert engine.time_median_s.tolist() == [13.0]
+    assert engine.time_iqr_s.tolist() == [2.0]
 
 
 def test_what_is_written_is_read_back(tmp_path: Path, some_sweep: Sweep) -> None:

@@ -32,7 +32,7 @@ def curve(name: str, factor: float = 1.0) -> Curve:
     )
 
 
-CURVES = [curve("native"), curve("stencil", 20.0)]
+CURVES = [curve("stencil", 20.0), curve("native")]
 
 
 def lines_of(figure: Figure, panel: int) -> list[tuple[list[float], list[float]]]:
@@ -75,7 +75,7 @@ def test_measured_predicted_front_and_chosen_are_where_they_belong() -> None:
     legend = figure.axes[0].get_legend()
     assert legend is not None
     named = [text.get_text() for text in legend.get_texts()]
-    expected = ["native", "stencil", "predicted, edge/(u-1)", "accuracy 5 mm", "Pareto front"]
+    expected = ["stencil", "native", "predicted, edge/(u-1)", "accuracy 5 mm", "Pareto front"]
     assert named == expected
     assert figure.axes[0].get_xscale() == figure.axes[0].get_yscale() == "log"
 

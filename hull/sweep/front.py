@@ -26,7 +26,7 @@ def pareto_front(costs: NDArray[np.float64]) -> NDArray[np.bool_]:
     known = ~np.isnan(costs).any(axis=1)  # (N,)
     on_front = np.zeros(len(costs), np.bool_)
     for choice in np.flatnonzero(known):
-        as_good = known & (costs <= costs[choice]).all(axis=1)
+        as_good = (costs <= costs[choice]).all(axis=1)  # never one with a NaN
         better = as_good & (costs < costs[choice]).any(axis=1)
         on_front[choice] = not better.any()
     return on_front
