@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -43,13 +43,14 @@ def print_summary(report: "Report") -> None:
         click.echo(f"  {numbers['frames_invalid']} frames could not be evaluated:")
         for reason, count in numbers["reasons"].items():
             click.echo(f"    {count} x {reason}")
-    rows = [("object", "verdict", "frames", "when", "points, most", "triangles, most")]
+    rows = [("object", "verdict", "frames", "certain", "when", "points, most", "triangles, most")]
     for found in numbers["objects"]:
         rows.append(
             (
                 found["name"],
                 found["verdict"],
                 f"{found['frames_colliding']}",
+                _certain_text(found),
                 _spans_text(found["spans"]),
                 f"{found['points_most']}",
                 f"{found['triangles_most']}",
@@ -59,8 +60,33 @@ def print_summary(report: "Report") -> None:
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         click.echo("  " + "  ".join(cells).rstrip())
+    for found in numbers["objects"]:
+        if missed := found["frames_colliding"] - found["frames_sampled_colliding"]:
+            click.echo(
+                f"  {found['name']}: in {missed} frames no sample collides, but a certified point; "
+                "--viewport or --accuracy-mm finds more points"
+            )
+    if numbers["sample_spacing_m"] is not None:
+        smallest, largest = numbers["viewports"]
+        viewports = f"viewport {largest}" if smallest == largest else f"{smallest} to {largest}"
+        click.echo(
+            f"  sampled at most {numbers['sample_spacing_m'] * 1e3:.3g} mm apart along edges: "
+            f"{viewports}, {numbers['samples']} samples"
+        )
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in numbers["stage_ms_mean"].items())
     click.echo(f"  ms of work a frame, mean: {stages}; engine {numbers['engine']}")
+
+
+def _certain_text(found: dict[str, Any]) -> str:
+    """Return how many frames have which certificate, in words."""
+    parts = [
+        f"{found[key]} {word}"
+        for key, word in (("frames_with_witness", "hit"), ("frames_proved_free", "free"))
+        if found[key]
+    ]
+    if found["frames_open"]:
+        parts.append(f"{found['frames_open']} open below {found['open_at_m'] * 1e3:.3g} mm")
+    return ", ".join(parts) or "-"
 
 
 def _spans_text(spans: list[dict[str, float]]) -> str:

@@ -9,6 +9,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,15 @@ from hybridve.hull.capture.recording import (
 from hybridve.hull.capture.rig import load_rig, rig_digest
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
-from hybridve.hull.contact.detect import Body, Contact, detect_contacts, make_body
+from hybridve.hull.contact.detect import (
+    Body,
+    Contact,
+    certify_contacts,
+    detect_contacts,
+    make_body,
+)
 from hybridve.hull.contact.scene import Scene
+from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Views, make_hull, make_views
 from hybridve.hull.report.schema import FrameResult
@@ -51,11 +59,14 @@ class EvaluateSettings:
     accuracy_m : float or None
         Or, instead, the largest spacing of samples along an edge: each triangle takes the smallest
         viewport that keeps it.
+    open_at_m : float or None
+        Verdicts are certified down to discs of this diameter; None leaves them as sampled.
     """
 
     frames: FrameRange = field(default_factory=FrameRange)
     viewport: int | None = 10
     accuracy_m: float | None = None
+    open_at_m: float | None = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,25 +175,31 @@ def evaluate(
         If the recording has none of the frames asked for.
     """
     n_yielded = 0
-    for silhouettes in _silhouettes(chain, skip, progress):
-        started = time.perf_counter()
-        contacts: tuple[Contact, ...] = ()
-        if silhouettes.masks is not None:
-            hull = make_hull(chain.views, silhouettes.masks)
-            contacts = tuple(detect_contacts(hull, chain.bodies, engine))
-        yield FrameResult(
-            index=silhouettes.index,
-            time_s=silhouettes.index / chain.session.fps,
-            reason=silhouettes.reason,
-            contacts=contacts,
-            stage_s={
-                "decode": silhouettes.decode_s,
-                "segment": silhouettes.segment_s,
-                "query": time.perf_counter() - started,
-                "write": write_s(),
-            },
-        )
-        n_yielded += 1
+    open_at_m = chain.settings.open_at_m
+    with Certifier(open_at_m) if open_at_m else nullcontext() as certifier:
+        for silhouettes in _silhouettes(chain, skip, progress):
+            started = time.perf_counter()
+            contacts: list[Contact] = []
+            if silhouettes.masks is not None:
+                hull = make_hull(chain.views, silhouettes.masks)
+                contacts = detect_contacts(hull, chain.bodies, engine)
+            queried = time.perf_counter()
+            if certifier is not None and contacts:
+                contacts = certify_contacts(hull, chain.bodies, contacts, certifier)
+            yield FrameResult(
+                index=silhouettes.index,
+                time_s=silhouettes.index / chain.session.fps,
+                reason=silhouettes.reason,
+                contacts=tuple(contacts),
+                stage_s={
+                    "decode": silhouettes.decode_s,
+                    "segment": silhouettes.segment_s,
+                    "query": queried - started,
+                    "certify": time.perf_counter() - queried,
+                    "write": write_s(),
+                },
+            )
+            n_yielded += 1
     if n_yielded + skip == 0:
         raise SessionError(
             f"{chain.session.path}: the recording has none of the frames "
@@ -213,6 +230,7 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "frames": str(chain.settings.frames),
         "viewport": chain.settings.viewport,
         "accuracy_m": chain.settings.accuracy_m,
+        "open_at_m": chain.settings.open_at_m,
         "unseen": session.unseen,
         "min_cameras": session.min_cameras,
         "mask_threshold": session.mask_threshold,
@@ -230,6 +248,8 @@ def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
             "mesh": str(scene_object.mesh_path),
             "triangles": len(body.triangles),
             "largest_viewport": int(body.triangles.viewports.max()),
+            "smallest_viewport": int(body.triangles.viewports.min()),
+            "samples": int(body.triangles.topology.samples_before[-1]),
             "sample_spacing_m": body.spacing_m,
             "required_clearance_m": scene_object.required_clearance_m,
         }

@@ -107,12 +107,12 @@ def draw_cameras(shot: Shot, columns: int = 2) -> Image:
 def _drawn_objects(shot: Shot) -> list[DrawnObject]:
     return [
         DrawnObject(
-            name=body.name,
-            vertices_world=body.triangles.vertices_world,
-            faces=body.triangles.faces,
+            name=part.name,
+            vertices_world=part.vertices_world,
+            faces=part.faces,
             collides=contact.collides,
             hit_triangles=np.unique(contact.triangle),
             hit_points_world=contact.points_world,
         )
-        for body, contact in zip(shot.chain.bodies, shot.contacts, strict=True)
+        for part, contact in zip(shot.chain.scene.objects, shot.contacts, strict=True)
     ]

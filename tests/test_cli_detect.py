@@ -335,3 +335,27 @@ def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
                 compared += 1
         assert compared > 10
     assert not (tmp_path / "report.h5.parts").exists()
+
+
+def test_what_the_samples_miss_is_certified_told_and_fails_on_clash(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At viewport 1 only centroids are asked: in some frames none is in the ball."""
+    path, plain = tmp_path / "certified.h5", tmp_path / "sampled.h5"
+    common = ("detect", session, "--scene", scene, "--viewport", 1)
+
+    assert run(*common, "-o", path, "--fail-on-clash") == 3
+    told = capsys.readouterr().out
+    assert run(*common, "-o", plain, "--open-at-mm", 0) == 0
+
+    hit = read_report(path).objects["hit"]
+    missed = (hit.certificate == "colliding") & ~hit.collides
+    assert missed.any()
+    assert f"hit: in {missed.sum()} frames no sample collides, but a certified point" in told
+    # The witness is on the cube's surface, in a frame whose ball is there.
+    np.testing.assert_allclose(np.abs(hit.witness_m[missed]).max(axis=1), HALF_M, atol=1e-9)
+    distance_m = np.linalg.norm(hit.witness_m[missed] - CENTERS[missed], axis=1)
+    assert (distance_m < 1.5 * BALL_RADIUS_M).all()
+    sampled = read_report(plain).objects["hit"]
+    np.testing.assert_array_equal(sampled.collides, hit.collides)
+    assert (sampled.certificate[missed] == "").all()

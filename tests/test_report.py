@@ -46,12 +46,15 @@ def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
         contacts = []
         for _ in range(0 if reason else n_objects):
             n_points = draw(st.integers(0, 4))
-            certificate = "colliding" if n_points else draw(st.sampled_from(["free", ""]))
+            certificate = draw(st.sampled_from(["colliding", "free", "open", ""]))
+            has_witness, is_open = certificate == "colliding", certificate == "open"
             contacts.append(
                 Contact(
                     certificate,
                     rng.normal(size=(n_points, 3)).astype(np.float32),
                     np.sort(rng.integers(0, 3, n_points)).astype(np.uint32),
+                    rng.normal(size=3) if has_witness else np.full(3, np.nan),
+                    rng.uniform() if is_open else np.nan,
                 )
             )
         stage_s = dict(zip(STAGES, rng.uniform(size=len(STAGES)).tolist(), strict=True))
@@ -97,12 +100,16 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
             if result.reason:
                 assert not rows.collides[row]
                 assert rows.certificate[row] == ""
+                assert np.isnan(rows.witness_m[row]).all()
+                assert np.isnan(rows.open_at_m[row])
                 assert len(xyz_m) == 0
                 continue
             contact = result.contacts[number]
             assert rows.collides[row] == contact.collides
             assert rows.n_triangles[row] == len(set(contact.triangle.tolist()))
             assert rows.certificate[row] == contact.certificate
+            np.testing.assert_array_equal(rows.witness_m[row], contact.witness_world)
+            np.testing.assert_array_equal(rows.open_at_m[row], contact.open_at_m)
             np.testing.assert_array_equal(xyz_m, contact.points_world)
             np.testing.assert_array_equal(triangle, contact.triangle)
 
@@ -297,9 +304,35 @@ def test_spans_cover_the_true_flags_and_nothing_else(flags: list[bool]) -> None:
     assert covered == flags
 
 
+NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+
+
+def test_a_witness_counts_as_a_collision_and_open_is_not_free(tmp_path: Path) -> None:
+    free = Contact("free", *NOTHING)
+    missed = Contact("colliding", *NOTHING, np.array([1.0, 2.0, 3.0]))
+    is_open = [Contact("open", *NOTHING, open_at_m=size_m) for size_m in (1e-4, 3e-4)]
+    path = tmp_path / "report.h5"
+
+    write_all(
+        path,
+        [
+            FrameResult(0, 0.0, "", (free, is_open[0]), {}),
+            FrameResult(1, 0.1, "", (missed, is_open[1]), {}),
+            FrameResult(2, 0.2, "", (free, free), {}),
+        ],
+    )
+
+    first, second = summarize(read_report(path))["objects"]
+    assert first["verdict"] == "colliding"
+    assert (first["frames_colliding"], first["frames_sampled_colliding"]) == (1, 0)
+    assert [span["first_frame"] for span in first["spans"]] == [1]
+    assert second["verdict"] == "open"
+    assert (second["frames_open"], second["frames_proved_free"]) == (2, 1)
+    assert second["open_at_m"] == 3e-4
+
+
 def test_an_object_is_called_free_only_if_every_evaluated_frame_is_proved(tmp_path: Path) -> None:
-    nothing = (np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
-    free, sampled = Contact("free", *nothing), Contact("", *nothing)
+    free, sampled = Contact("free", *NOTHING), Contact("", *NOTHING)
     stage_s = dict.fromkeys(STAGES, 0.0)
     path = tmp_path / "report.h5"
 

@@ -1,10 +1,11 @@
 """Which CAD objects touch the hull, where, and how sure that is.
 
 Section 4.2.4 of the paper: bounding boxes first, then every triangle of the objects whose box may
-touch the hull; collision points are positions on the surface of the object.
+touch the hull; collision points are positions on the surface of the object. Samples alone say
+nothing about what lies between them, so a certificate stands beside them (`certify_contacts`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -12,14 +13,17 @@ from numpy.typing import NDArray
 
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.bounds import boxes_are_free
+from hybridve.hull.query.certify import COLLIDING, FREE, Certifier
+from hybridve.hull.query.clusters import spatial_order
 from hybridve.hull.query.engine import Engine, Hits, Triangles
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import Real, hit_positions, viewports_for_accuracy
 
-#: "colliding": a sample of the surface is inside every silhouette. "free": proved, no point of the
-#: object is in the hull. "": only sampled; a smaller contact may hide between the samples.
-Certificate = Literal["colliding", "free", ""]
+#: "colliding": a point of the surface, the witness, is inside every silhouette. "free": proved, no
+#: point of the object is in the hull. "open": nothing as wide as `Contact.open_at_m` is. "": only
+#: sampled; a smaller contact may hide between the samples.
+Certificate = Literal["colliding", "free", "open", ""]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +35,9 @@ class Body:
     name : str
         The object.
     triangles : Triangles
-        Its mesh.
+        Its mesh, neighbours in space next to each other.
+    numbers : (T,) uint32
+        The number that each triangle has in the scene.
     lower_world, upper_world : (3,) float64
         Its axis-aligned bounding box, metres.
     spacing_m : float
@@ -40,6 +46,7 @@ class Body:
 
     name: str
     triangles: Triangles
+    numbers: NDArray[np.uint32]
     lower_world: NDArray[np.float64]
     upper_world: NDArray[np.float64]
     spacing_m: float
@@ -52,16 +59,23 @@ class Contact:
     Attributes
     ----------
     certificate : Certificate
-        How far the verdict can be trusted.
+        How far the verdict can be trusted. It may say "colliding" where no sample does.
     points_world : (P, 3) float32
-        The collision points CP_i in metres, sorted by triangle; none if the object is not touched.
+        The collision points CP_i in metres, those of a triangle together; none if no sample of the
+        object is in the hull.
     triangle : (P,) uint32
-        The triangle that each collision point lies on.
+        The triangle of the scene that each collision point lies on.
+    witness_world : (3,) float64
+        Metres: a point of the surface that is in the hull; NaN unless it is certified to collide.
+    open_at_m : float
+        No disc of this diameter on the surface is in the hull; NaN unless it is "open".
     """
 
     certificate: Certificate
     points_world: NDArray[np.float32]
     triangle: NDArray[np.uint32]
+    witness_world: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.nan))
+    open_at_m: float = np.nan
 
     @property
     def collides(self) -> bool:
@@ -96,9 +110,11 @@ def make_body(
         viewports = np.full(len(corners), viewport, np.int32)
     edges_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     lower, upper = scene_object.box_world
+    order = spatial_order(scene_object.vertices_world, scene_object.faces)
     return Body(
         scene_object.name,
-        Triangles(scene_object.vertices_world, scene_object.faces, viewports),
+        Triangles(scene_object.vertices_world, scene_object.faces[order], viewports[order]),
+        order.astype(np.uint32),
         lower,
         upper,
         float((edges_m / np.maximum(viewports - 1, 1)).max()),
@@ -106,7 +122,7 @@ def make_body(
 
 
 def detect_contacts(hull: Hull, bodies: list[Body], engine: Engine) -> list[Contact]:
-    """Return for each body its contact with the hull of one frame."""
+    """Return for each body its contact with the hull of one frame, as its samples tell it."""
     if not bodies:
         return []
     free = boxes_are_free(
@@ -122,6 +138,25 @@ def detect_contacts(hull: Hull, bodies: list[Body], engine: Engine) -> list[Cont
     ]
 
 
+def certify_contacts(
+    hull: Hull, bodies: list[Body], contacts: list[Contact], certifier: Certifier
+) -> list[Contact]:
+    """Return contacts with a certificate for those that are only sampled."""
+    return [
+        _certified(hull, body, contact, certifier) if contact.certificate == "" else contact
+        for body, contact in zip(bodies, contacts, strict=True)
+    ]
+
+
+def _certified(hull: Hull, body: Body, contact: Contact, certifier: Certifier) -> Contact:
+    found = certifier.certify_mesh(hull, body.triangles)
+    if found.verdict == FREE:
+        return replace(contact, certificate="free")
+    if found.verdict == COLLIDING:
+        return replace(contact, certificate="colliding", witness_world=found.witness_world)
+    return replace(contact, certificate="open", open_at_m=found.open_at_m)
+
+
 def _no_contact(certificate: Certificate) -> Contact:
     return Contact(certificate, np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
 
@@ -130,12 +165,16 @@ def _contact(hull: Hull, body: Body, hits: Hits) -> Contact:
     if len(hits) == 0:
         return _no_contact("")
     triangle, sample = hits.samples()
+    points_world = _place(body, triangle, sample, np.zeros((len(triangle), 3), np.float32))
+    contact = Contact("", points_world, body.numbers[triangle])
     # An engine in single precision may err at the rim of a silhouette; a witness may not.
     few = slice(0, _MAX_WITNESSES)
-    witnesses_world = _place(body, triangle[few], sample[few], np.zeros((len(triangle[few]), 3)))
-    has_witness = bool(contains_points(hull, witnesses_world).any())
-    points_world = _place(body, triangle, sample, np.zeros((len(triangle), 3), np.float32))
-    return Contact("colliding" if has_witness else "", points_world, triangle)
+    candidates_world = _place(body, triangle[few], sample[few], np.zeros((len(triangle[few]), 3)))
+    inside = contains_points(hull, candidates_world)
+    if not inside.any():
+        return contact
+    witness_world = candidates_world[int(inside.argmax())]
+    return replace(contact, certificate="colliding", witness_world=witness_world)
 
 
 def _place(

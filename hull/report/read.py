@@ -24,6 +24,10 @@ class ObjectColumns:
     collides : (F,) bool
     n_points, n_triangles : (F,) uint32
     certificate : (F,) str
+    witness_m : (F, 3) float64
+        A point of the surface in the hull, world frame; NaN unless certified to collide.
+    open_at_m : (F,) float64
+        No disc of this diameter on the surface is in the hull; NaN unless open.
     offset : (F + 1,) uint64
         The collision points of row f are ``offset[f]`` to ``offset[f + 1]``; see `read_points`.
     about : dict
@@ -34,6 +38,8 @@ class ObjectColumns:
     n_points: NDArray[np.uint32]
     n_triangles: NDArray[np.uint32]
     certificate: NDArray[np.str_]
+    witness_m: NDArray[np.float64]
+    open_at_m: NDArray[np.float64]
     offset: NDArray[np.uint64]
     about: dict[str, Any]
 
@@ -98,6 +104,8 @@ def read_report(path: Path) -> Report:
                     n_points=group["n_points"][:],
                     n_triangles=group["n_triangles"][:],
                     certificate=group["certificate"].asstr()[:].astype(np.str_),
+                    witness_m=group["witness_m"][:],
+                    open_at_m=group["open_at_m"][:],
                     offset=group["points/offset"][:],
                     about={key: _plain(value) for key, value in group.attrs.items()},
                 )

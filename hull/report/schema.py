@@ -13,7 +13,7 @@ FORMAT = "hybridve-report"
 VERSION = 1
 
 #: The stages whose seconds a report keeps, in the order in which a frame runs through them.
-STAGES = ("decode", "segment", "query", "write")
+STAGES = ("decode", "segment", "query", "certify", "write")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -181,7 +181,15 @@ class ReportWriter:
 
         rows = list(
             self._part_columns(
-                "index", "time_s", "reason", "stage_", "n_points_", "n_triangles_", "certificate_"
+                "index",
+                "time_s",
+                "reason",
+                "stage_",
+                "n_points_",
+                "n_triangles_",
+                "certificate_",
+                "witness_",
+                "open_at_",
             )
         )
         if not rows:
@@ -238,7 +246,22 @@ class ReportWriter:
             "certificate",
             frame[f"certificate_{number}"],
             "colliding: a witness point is in every silhouette; free: proved, no point of the "
-            "object is in the hull; empty: sampled only, or not evaluated",
+            "object is in the hull; open: no disc of diameter open_at_m on its surface is in the "
+            "hull; empty: sampled only, or not evaluated",
+        )
+        _store(
+            group,
+            "witness_m",
+            frame[f"witness_{number}"],
+            "m",
+            "a point of the surface in every silhouette, world frame; NaN unless colliding",
+        )
+        _store(
+            group,
+            "open_at_m",
+            frame[f"open_at_{number}"],
+            "m",
+            "no disc of this diameter on the surface is in the hull; NaN unless open",
         )
         offset = np.concatenate([[0], np.cumsum(n_points, dtype=np.uint64)]).astype(np.uint64)
         _store(
@@ -327,6 +350,12 @@ def _columns(results: list[FrameResult], n_objects: int) -> dict[str, NDArray[An
         )
         columns[f"certificate_{number}"] = np.array(
             [c.certificate if c is not None else "" for c in contacts], np.str_
+        )
+        columns[f"witness_{number}"] = np.array(
+            [c.witness_world if c is not None else np.full(3, np.nan) for c in contacts]
+        )
+        columns[f"open_at_{number}"] = np.array(
+            [c.open_at_m if c is not None else np.nan for c in contacts], np.float64
         )
         columns[f"xyz_{number}"] = np.concatenate(
             [c.points_world for c in there] or [np.zeros((0, 3), np.float32)]
