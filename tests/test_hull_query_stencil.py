@@ -460,3 +460,17 @@ def test_it_is_opened_by_name_and_gives_back_its_own_device() -> None:
             assert engine.renderer
             (hits,) = engine.query(hull, [mesh])
         assert len(hits) == len(mesh) * 55
+
+
+def test_engines_with_devices_of_their_own_take_turns() -> None:
+    views = ring_views()
+    frames = [ball_hull(views, np.array([x, 0.0, 0.0]), 0.15) for x in (0.5, -0.4)]
+    mesh = sphere_mesh(500)
+    expected = [reference.query(hull, [mesh])[0] for hull in frames]
+
+    with Stencil(window_px=60) as first, Stencil() as second:
+        for hull, hits in zip(frames, expected, strict=True):
+            for engine in (first, second):
+                (found,) = engine.query(hull, [mesh])
+
+                assert differences(views, mesh, found, hits, EDGE_BAND_PX).outside_band == []
