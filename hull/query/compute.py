@@ -41,7 +41,9 @@ from hybridve.hull.query.device import (
 from hybridve.hull.query.engine import Hits, Topology, Triangles
 from hybridve.hull.query.silhouettes import Hull, Views
 
-#: Triangles of a cluster: CLUSTER in the shaders, a multiple of their GROUP.
+#: Triangles of a cluster: CLUSTER in the shaders, a multiple of their GROUP. Of 32, 64, 128 and 256
+#: the fastest for a million triangles on a software renderer, and one work group of hardware. All
+#: clusters of 4 million triangles are asked in 3.5 ms there: clusters of clusters would save less.
 _CLUSTER = 64
 #: Edge in samples of the blocks that the last pass takes: BLOCK in the shaders, where the rows of
 #: a block are the bits of a word.
