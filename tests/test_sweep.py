@@ -46,6 +46,8 @@ SINGLE_M = 1e-6
 
 N_CAMERAS = 5
 
+NO_POINT = np.zeros((0, 3))
+
 
 def ball_hull(center: tuple[float, float, float]) -> Hull:
     matrices = [ring_matrix(camera, N_CAMERAS) for camera in range(N_CAMERAS)]
@@ -157,11 +159,11 @@ def test_distances_are_those_of_brute_force(viewport: int) -> None:
     (body,) = make_rows([one], (2,), 1.0)[0].bodies
     longest_m = np.sqrt(2) * 2 * half_m
     u = int(np.ceil(longest_m / outcome.truth.spacing_m) + 1)
-    distances, missed = [], 0
+    of_witnesses, of_samples, missed = [], [], 0
     for hull in hulls:
-        witnesses = certify_by_samples(hull, body.triangles, 0.01)
-        truth = [witnesses.witness_world[witnesses.verdict == 2]]
-        reported = []
+        certificates = certify_by_samples(hull, body.triangles, 0.01)
+        witnesses = certificates.witness_world[certificates.verdict == COLLIDING]
+        truth, reported = [], []
         for triangle in corners:
             for viewports, found in ((u, truth), (viewport, reported)):
                 grid = [(i, j) for j in range(viewports) for i in range(viewports - j)]
@@ -170,14 +172,19 @@ def test_distances_are_those_of_brute_force(viewport: int) -> None:
                 places = a + (b - a) * i + (c - a) * j
                 found.append(places[contains_points(hull, places)])
             missed += len(truth[-1]) > 0 and len(reported[-1]) == 0
-        gaps = np.concatenate(truth)[:, None] - np.concatenate(reported)[None]
-        distances.append(np.linalg.norm(gaps, axis=2).min(axis=1))
-    expected = np.concatenate(distances)
+        for true_world, distances in (
+            (witnesses, of_witnesses),
+            (np.concatenate(truth), of_samples),
+        ):
+            gaps = true_world[:, None] - np.concatenate(reported)[None]
+            distances.append(np.linalg.norm(gaps, axis=2).min(axis=1))
+    sampled = np.concatenate(of_samples)
+    expected = np.concatenate([*of_witnesses, sampled])
     (engine,) = outcome.engines
     assert outcome.frames.truth_points.sum() == len(expected) > 100
     assert engine.distance_max_m[0] == pytest.approx(expected.max(), abs=SINGLE_M)
-    assert engine.distance_median_m[0] == pytest.approx(np.median(expected), abs=SINGLE_M)
-    assert engine.distance_p99_m[0] == pytest.approx(np.percentile(expected, 99), abs=SINGLE_M)
+    assert engine.distance_median_m[0] == pytest.approx(np.median(sampled), abs=SINGLE_M)
+    assert engine.distance_p99_m[0] == pytest.approx(np.percentile(sampled, 99), abs=SINGLE_M)
     within = np.mean(expected <= longest_m / (viewport - 1) + SINGLE_M)
     assert engine.within_predicted[0] == pytest.approx(within)
     assert engine.triangles_missed[0] == missed
@@ -350,28 +357,31 @@ def test_an_engine_that_contradicts_a_proof_is_found_out() -> None:
 def test_a_dense_sample_is_a_witness_of_a_triangle_left_open() -> None:
     hull = ball_hull((0.0, 0.0, 0.0))
     (body,) = make_rows([LARGE], (2,), 1.0)[0].bodies
-    left_open = BodyTruth(np.array([OPEN], np.int8), np.zeros((0, 3)), 0.1)
-    proved = BodyTruth(np.array([FREE], np.int8), np.zeros((0, 3)), 0.0)
+    left_open = BodyTruth(np.array([OPEN], np.int8), NO_POINT, NO_POINT, 0.1)
+    proved = BodyTruth(np.array([FREE], np.int8), NO_POINT, NO_POINT, 0.0)
     dense = dense_mesh(body.triangles, np.array([True]), 0.05)
 
     found = sample_body(hull, left_open, dense, Reference(), 100)
 
     assert found.collides
-    assert 50 < len(found.points_world) <= 101
-    assert contains_points(hull, found.points_world).all()
+    assert len(found.witnesses_world) == 1
+    assert 50 < len(found.dense_world) <= 100
+    assert contains_points(hull, found.witnesses_world).all()
+    assert contains_points(hull, found.dense_world).all()
     assert not sample_body(hull, proved, dense, Reference(), 100).collides
 
 
 def test_every_triangle_that_a_dense_sample_convicts_keeps_a_point() -> None:
     hull = ball_hull((0.0, 0.0, 0.0))
     (body,) = make_rows([box(0.05)], (2,), 1.0)[0].bodies  # wholly inside the ball
-    left_open = BodyTruth(np.full(12, OPEN, np.int8), np.zeros((0, 3)), 0.1)
+    left_open = BodyTruth(np.full(12, OPEN, np.int8), NO_POINT, NO_POINT, 0.1)
     dense = dense_mesh(body.triangles, np.ones(12, np.bool_), 0.05)
 
     found = sample_body(hull, left_open, dense, Reference(), 1)
 
     assert (found.verdict == COLLIDING).all()
-    assert len(found.points_world) == 12 + 1
+    assert len(found.witnesses_world) == 12
+    assert len(found.dense_world) == 1
 
 
 def test_without_certificates_the_dense_samples_alone_make_the_truth() -> None:
@@ -547,6 +557,8 @@ def test_times_that_follow_no_pixel_leave_a_residual_and_no_negative_cost() -> N
     assert min(model.fixed_s, model.fill_s_per_px, model.read_back_s_per_px) >= 0
     assert model.residual_most > 0.3
     assert model.holds is False
+    assert replace(model, freedom=0).holds is False
+    assert replace(model, freedom=0, residual_most=0.0).holds is None
     assert model.condition > 100, "fill and read-back grow alike"
 
 

@@ -93,13 +93,22 @@ class _Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judgement:
-    """What one engine's answer to one row is worth, over all frames."""
+    """What one engine's answer to one row is worth, over all frames.
+
+    The last two are the distances of the truth's witnesses and of its dense samples.
+    """
 
     n_points: int
     triangles_missed: int
     objects_missed: int
     triangles_against_proof: int
-    distances_m: NDArray[np.float64]
+    witness_m: NDArray[np.float64]
+    dense_m: NDArray[np.float64]
+
+    @property
+    def distances_m(self) -> NDArray[np.float64]:
+        """Of all true points to the nearest reported ones."""
+        return np.concatenate([self.witness_m, self.dense_m])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -301,7 +310,7 @@ def _judge_row(
     Engines mostly agree to the sample: `known` keeps the distances by what was answered.
     """
     n_points = triangles_missed = objects_missed = against_proof = 0
-    distances_m = [np.zeros(0)]
+    witness_m, dense_m = [np.zeros(0)], [np.zeros(0)]
     for number, frame in enumerate(frames):
         for index, hits in _answer(room, frame, row).items():
             one = truth[number][index]
@@ -313,15 +322,23 @@ def _judge_row(
             if one.collides and len(hits) == 0:
                 objects_missed += 1
             reported_world = _place(row.bodies[index], hits)  # to warm up, even if it is known
-            if len(hits) == 0 or len(one.points_world) == 0:
+            true_world = np.concatenate([one.witnesses_world, one.dense_world])
+            if len(hits) == 0 or len(true_world) == 0:
                 continue
             key = hashlib.sha256(b"%d %d" % (number, index))
             key.update(hits.start.tobytes() + hits.stop.tobytes())
             if key.digest() not in known:
-                known[key.digest()] = nearest_distances(one.points_world, reported_world)
-            distances_m.append(known[key.digest()])
+                known[key.digest()] = nearest_distances(true_world, reported_world)
+            found_m = known[key.digest()]
+            witness_m.append(found_m[: len(one.witnesses_world)])
+            dense_m.append(found_m[len(one.witnesses_world) :])
     return _Judgement(
-        n_points, triangles_missed, objects_missed, against_proof, np.concatenate(distances_m)
+        n_points,
+        triangles_missed,
+        objects_missed,
+        against_proof,
+        np.concatenate(witness_m),
+        np.concatenate(dense_m),
     )
 
 
@@ -441,7 +458,10 @@ def _frame_columns(frames: Sequence[HullFrame], bodies: list[Body], truth: _Trut
             [sum(one.collides for one in frame.values()) for frame in truth.frames], np.uint32
         ),
         truth_points=np.array(
-            [sum(len(one.points_world) for one in frame.values()) for frame in truth.frames],
+            [
+                sum(len(one.witnesses_world) + len(one.dense_world) for one in frame.values())
+                for frame in truth.frames
+            ],
             np.uint64,
         ),
     )
@@ -480,8 +500,8 @@ def _engine_sweep(
             [one.triangles_against_proof for one in judged], np.uint32
         ),
         distance_max_m=np.array([_largest(one.distances_m) for one in judged]),
-        distance_p99_m=np.array([_percentile(one.distances_m, 99) for one in judged]),
-        distance_median_m=np.array([_percentile(one.distances_m, 50) for one in judged]),
+        distance_p99_m=np.array([_percentile(one.dense_m, 99) for one in judged]),
+        distance_median_m=np.array([_percentile(one.dense_m, 50) for one in judged]),
         within_predicted=np.array(
             [
                 float(np.mean(one.distances_m <= predicted_m + _ROUNDING_M))

@@ -62,14 +62,17 @@ class BodyTruth:
     ----------
     verdict : (T,) int8
         `FREE`, `OPEN` or `COLLIDING`, of every triangle.
-    points_world : (N, 3) float64
-        Collision points in metres: a witness of each triangle, and dense samples.
+    witnesses_world : (W, 3) float64
+        A collision point in metres of each triangle that is certified to collide.
+    dense_world : (N, 3) float64
+        Collision points in metres, evenly spread over the colliding surface.
     open_at_m : float
         No disc of this diameter on a triangle that was left open is in the hull; 0 if none was.
     """
 
     verdict: NDArray[np.int8]
-    points_world: NDArray[np.float64]
+    witnesses_world: NDArray[np.float64]
+    dense_world: NDArray[np.float64]
     open_at_m: float
 
     @property
@@ -79,12 +82,13 @@ class BodyTruth:
 
 
 def certify_body(hull: Hull, body: Body, certify: Certify, open_at_m: float) -> BodyTruth:
-    """Return the verdicts on a body's triangles, and the witnesses as its collision points."""
+    """Return the verdicts on a body's triangles, and the witnesses."""
     certificates = certify(hull, body.triangles, open_at_m)
     verdict = np.asarray(certificates.verdict)
     return BodyTruth(
         verdict,
         certificates.witness_world[verdict == COLLIDING],
+        np.zeros((0, 3)),
         float(certificates.open_at_m[verdict == OPEN].max(initial=0.0)),
     )
 
@@ -130,7 +134,7 @@ def dense_mesh(mesh: Triangles, near: NDArray[np.bool_], spacing_m: float) -> Tr
 def sample_body(
     hull: Hull, truth: BodyTruth, dense: Triangles, engine: Engine, points_most: int
 ) -> BodyTruth:
-    """Return the truth with the collision points of a dense mesh, thinned to so many.
+    """Return the truth with the samples of a dense mesh that collide, thinned to so many.
 
     Triangles that the certificate left open and of which a sample collides, asked again in double
     precision, are colliding: the sample is their witness.
@@ -145,13 +149,8 @@ def sample_body(
     verdict[touched[stands]] = COLLIDING
     return BodyTruth(
         verdict,
-        np.concatenate(
-            [
-                truth.points_world,
-                witnesses_world[stands],
-                _positions(dense, *thinned_samples(hits, points_most)),
-            ]
-        ),
+        np.concatenate([truth.witnesses_world, witnesses_world[stands]]),
+        _positions(dense, *thinned_samples(hits, points_most)),
         truth.open_at_m,
     )
 
