@@ -211,6 +211,7 @@ def sweep(
                 truth_room=truth_room,
                 repeats=repeats,
                 advance=advance,
+                leave_out=None if engines else _leave_out,
             )
     write_sweep(
         output,
@@ -222,7 +223,7 @@ def sweep(
             settings={
                 **resolved_settings(chain),
                 "viewports": list(viewports),
-                "engines": [room.engine.name for room in rooms],
+                "engines": [engine.name for engine in outcome.engines],
                 "repeats": repeats,
                 "open_at_m": open_at_mm / 1e3,
                 "objects": list(about_objects(chain)),
@@ -270,8 +271,12 @@ def _open_rooms(engines: tuple[options.EngineName, ...], stack: ExitStack) -> li
         except (DeviceError, ImportError) as error:  # ImportError: moderngl without its libraries
             if engines:
                 raise DeviceError(f"engine {name}: {error}") from error
-            click.echo(f"{name} is left out: {error}", err=True)
+            _leave_out(name, error)
     return rooms
+
+
+def _leave_out(name: str, error: Exception) -> None:
+    click.echo(f"{name} is left out: {error}", err=True)
 
 
 def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
@@ -280,6 +285,9 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
     found = sweep_as_dict(sweep)
     truth = found["truth"]
     click.echo(f"{output}, {picture}: {len(found['frames'])} frames {sweep.settings['frames']}")
+    finest = f"sampled every {_mm(truth['spacing_m'])} mm"
+    if (truth["spacing_m"] or 0.0) > (truth["spacing_wanted_m"] or 0.0):
+        finest += f" ({_mm(truth['spacing_wanted_m'])} were wanted, but are too many)"
     left_open = "none is left open"
     if truth["triangles_open"]:
         left_open = (
@@ -287,8 +295,8 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
         )
     click.echo(
         f"  truth: {truth['triangles_colliding']} of {truth['triangles_asked']} triangles asked "
-        f"collide, {left_open}; distances from {truth['points']} points, sampled every "
-        f"{_mm(truth['spacing_m'])} mm (wanted: {_mm(truth['spacing_wanted_m'])})"
+        f"collide, {left_open}"
+        + (f"; distances from {truth['points']} points, {finest}" if truth["points"] else "")
     )
     lines = [
         (

@@ -5,7 +5,9 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +21,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import ReportError
+from hybridve.calib.errors import DeviceError, ReportError
 from hybridve.hull.contact.scene import SceneObject
+from hybridve.hull.query import stencil
 from hybridve.hull.query.engine import Engine, Hits, Triangles
 from hybridve.hull.query.reference import Reference, contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull, make_views
@@ -93,9 +96,10 @@ def sweep_of(
     repeats: int = 1,
     **others: Any,
 ) -> Outcome:
-    rooms = [EngineRoom(engine) for engine in engines]
-    with EngineRoom(Reference) as truth_room:
-        outcome = run_sweep(
+    with ExitStack() as stack:
+        rooms = [stack.enter_context(EngineRoom(engine)) for engine in engines]
+        truth_room = stack.enter_context(EngineRoom(Reference))
+        return run_sweep(
             frames_of(objects, hulls),
             make_rows(objects, viewports, accuracy_m),
             rooms,
@@ -104,9 +108,6 @@ def sweep_of(
             repeats=repeats,
             **{"certify": certify_by_samples, **others},
         )
-    for room in rooms:
-        room.__exit__(None, None, None)
-    return outcome
 
 
 LARGE = thing([(-1.5, -1.0, 0.0), (1.5, -1.0, 0.0), (0.0, 1.5, 0.0)])
@@ -331,6 +332,40 @@ def test_times_are_means_over_frames_and_the_model_finds_what_made_them() -> Non
     assert engine.cost.residual_most < 1e-9
     assert engine.cost.fitted.tolist() == [True] * 5 + [False]
     assert abs(engine.cost.residual[5]) < 1e-9, "the row that was not fitted is foretold"
+
+
+class Broken(Logged):
+    """An engine that opens, and whose device fails at the second viewport."""
+
+    def query(self, hull: Hull, meshes: list[Triangles]) -> list[Hits]:
+        if meshes[0].viewports[0] == 4:
+            raise DeviceError("out of memory")
+        return super().query(hull, meshes)
+
+
+def test_an_engine_whose_device_fails_is_left_out_if_that_is_allowed() -> None:
+    log: list[Any] = []
+    told: list[tuple[str, str]] = []
+    hulls = [ball_hull((0.0, 0.0, 0.0))]
+    broken = partial(Broken, "broken", log, Clock())
+
+    outcome = sweep_of(
+        [LARGE],
+        hulls,
+        (2, 4, 8),
+        engines=(broken, Reference),
+        repeats=2,
+        leave_out=lambda name, error: told.append((name, str(error))),
+    )
+
+    assert told == [("broken", "out of memory")]
+    (left,) = outcome.engines
+    assert left.name == "reference"
+    assert left.points[2] == sweep_of([LARGE], hulls, (2, 4, 8)).engines[0].points[2] > 0
+    with pytest.raises(DeviceError, match="out of memory"):
+        sweep_of([LARGE], hulls, (2, 4), engines=(broken, Reference))
+    with pytest.raises(DeviceError, match="out of memory"):
+        sweep_of([LARGE], hulls, (2, 4), engines=(broken,), leave_out=lambda *_: None)
 
 
 def test_an_engine_that_contradicts_a_proof_is_found_out() -> None:
@@ -579,15 +614,14 @@ def test_too_little_to_fit_is_no_model(n_fitted: int, transforms: float) -> None
 
 
 @given(viewports=st.lists(st.integers(1, 300), min_size=1, max_size=30))
-def test_windows_hold_every_viewport_and_not_much_else(viewports: list[int]) -> None:
+def test_the_pixels_read_back_are_those_of_the_windows_of_the_stencil_engine(
+    viewports: list[int],
+) -> None:
     sizes = np.array(viewports, np.int32)
 
     pixels = window_px_read(sizes, window_px=128)
 
-    assert pixels % 128 == 0
-    assert pixels >= (0.5 * sizes.astype(float) ** 2).sum()
-    shelf_or_tiles = sum(size * 128 if size <= 128 else (size + 128) ** 2 for size in viewports)
-    assert pixels <= shelf_or_tiles
+    assert pixels == 128 * sum(piece.n_rows for piece in stencil._lay_out(sizes, 128).pieces)
 
 
 def test_few_frames_are_spread_over_the_recording() -> None:

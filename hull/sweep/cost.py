@@ -78,35 +78,41 @@ def fit_cost(
     )
 
 
-def window_px_read(viewports: NDArray[np.int32], window_px: int = 2048) -> int:
-    """Return how many pixels of windows are read back for viewports laid into them in shelves.
+def window_px_read(viewports: NDArray[np.int32], window_px: int) -> int:
+    """Return how many pixels of windows the stencil engine reads back for the viewports of a mesh.
 
-    Viewports of one size stand side by side in shelves as wide as the window; a window is read
-    back as far as it is filled, so that the count does not depend on how many rounds it takes. A
-    viewport larger than the window is cut into tiles, those beyond its diagonal left out.
+    They stand side by side in shelves as wide as the window, the largest first, and a window is
+    read back as far as it is filled, so that the count does not depend on how many rounds it
+    takes. A viewport larger than the window is cut into tiles, those beyond its diagonal left out.
 
     Parameters
     ----------
     viewports : (T,) int32
         The viewport of each triangle.
     window_px : int
-        Width of the window; the default is that of the stencil engine.
+        Width and height of the window.
 
     Examples
     --------
-    Three viewports of 20 pixels a side side by side, of which two find room in a shelf:
+    Three viewports of 20 pixels a side, of which two find room in a shelf:
 
     >>> window_px_read(np.array([20, 20, 20], np.int32), window_px=50)
     2000
     """
-    total = 0
-    for size, count in zip(*np.unique(viewports, return_counts=True), strict=True):
-        if size <= window_px:
-            beside = window_px // int(size)
-            total += -(-int(count) // beside) * int(size) * window_px
-        else:
-            total += int(count) * sum(
-                -(-(int(size) - row) // window_px) * min(window_px, int(size) - row) * window_px
-                for row in range(0, int(size), window_px)
+    rows = room_px = 0
+    for size, count in reversed(list(zip(*np.unique(viewports, return_counts=True), strict=True))):
+        side, left = int(size), int(count)
+        if side > window_px:
+            rows += left * sum(
+                -(-(side - start) // window_px) * min(window_px, side - start)
+                for start in range(0, side, window_px)
             )
-    return total
+            continue
+        left -= min(left, room_px // side)
+        room_px -= (int(count) - left) * side
+        if left:
+            beside = window_px // side
+            shelves = -(-left // beside)
+            rows += shelves * side
+            room_px = window_px - (left - (shelves - 1) * beside) * side
+    return rows * window_px

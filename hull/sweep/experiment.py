@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.errors import DeviceError
 from hybridve.hull.contact.detect import Body, make_body
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.engine import Engine, Hits
@@ -113,7 +114,7 @@ class _Judgement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Work:
-    """What the cost model counts, a frame: n m; per row n m u^2 / 2 and pixels of windows."""
+    """What the cost model counts, a frame: n m; per row n m u^2 / 2 and the stencil's windows."""
 
     transforms: float
     fill_px: NDArray[np.float64]
@@ -161,6 +162,7 @@ def run_sweep(
     repeats: int,
     clock: Clock = time.perf_counter,
     advance: Callable[[], object] = lambda: None,
+    leave_out: Callable[[str, DeviceError], object] | None = None,
 ) -> Outcome:
     """Return what every engine costs and misses in every row.
 
@@ -183,9 +185,17 @@ def run_sweep(
     advance : callable
         Told after each frame of truth, and each time an engine has answered a row:
         F + U (R + 1) times the number of engines.
+    leave_out : callable, optional
+        Told ``(name, error)`` of an engine whose device fails when it warms up, which the others
+        then do without. By default the error ends the sweep, as it does if no engine is left.
+
+    Raises
+    ------
+    DeviceError
+        If the device of an engine fails.
     """
     truth = _find_truth(frames, rows, certify, open_at_m, truth_room, advance)
-    judged = _judge_all(frames, rows, rooms, truth, advance)
+    rooms, judged = _judge_all(frames, rows, rooms, truth, advance, leave_out)
     query_s = np.zeros((len(rooms), len(rows), repeats))
     place_s = np.zeros_like(query_s)
     for repeat in range(repeats):
@@ -207,7 +217,7 @@ def run_sweep(
         ]
     )
     on_front = pareto_front(costs).reshape(len(rooms), len(rows))
-    work = _count_work(frames, rows)
+    work = _count_work(frames, rows, [room.engine.name for room in rooms])
     columns = _row_columns(rows, truth.near_triangles)
     return Outcome(
         columns,
@@ -287,15 +297,22 @@ def _judge_all(
     rooms: Sequence[EngineRoom],
     truth: _Truth,
     advance: Callable[[], object],
-) -> list[list[_Judgement]]:
-    """Return what every engine's answer to every row is worth: engines, then rows."""
-    judged: list[list[_Judgement]] = [[] for _ in rooms]
+    leave_out: Callable[[str, DeviceError], object] | None,
+) -> tuple[list[EngineRoom], list[list[_Judgement]]]:
+    """Return the engines whose devices serve, and what each one's answer to each row is worth."""
+    judged: dict[EngineRoom, list[_Judgement]] = {room: [] for room in rooms}
     for row in rows:
         known: dict[bytes, NDArray[np.float64]] = {}
-        for engine, room in enumerate(rooms):
-            judged[engine].append(room.call(_judge_row, room, frames, row, truth.frames, known))
+        for room in list(judged):
+            try:
+                judged[room].append(room.call(_judge_row, room, frames, row, truth.frames, known))
+            except DeviceError as error:
+                if leave_out is None or len(judged) == 1:
+                    raise
+                leave_out(room.engine.name, error)
+                del judged[room]
             advance()
-    return judged
+    return list(judged), list(judged.values())
 
 
 def _judge_row(
@@ -381,14 +398,18 @@ def _place(body: Body, hits: Hits) -> NDArray[np.float32]:
     )
 
 
-def _count_work(frames: Sequence[HullFrame], rows: Sequence[Row]) -> _Work:
+def _count_work(frames: Sequence[HullFrame], rows: Sequence[Row], engines: list[str]) -> _Work:
     n_cameras = len(frames[0].hull.views)
     share = np.mean([frame.near for frame in frames], axis=0)  # (B,) of the frames ask the body
     viewports = [[body.triangles.viewports for body in row.bodies] for row in rows]
     fill_px = np.array(
         [[0.5 * (one.astype(np.float64) ** 2).sum() for one in row] for row in viewports]
     )
-    window_px = np.array([[float(window_px_read(one)) for one in row] for row in viewports])
+    window_px = np.zeros_like(fill_px)
+    if "stencil" in engines:
+        from hybridve.hull.query.stencil import WINDOW_PX  # late: it loads OpenGL
+
+        window_px[:] = [[window_px_read(one, WINDOW_PX) for one in row] for row in viewports]
     return _Work(
         transforms=n_cameras * float(share @ [len(one) for one in viewports[0]]),
         fill_px=n_cameras * fill_px @ share,
