@@ -24,7 +24,7 @@ REJECTS, ACCEPTS, ABSTAINS, UNDECIDED = 0, 1, 2, 3
 BATCH = 256
 
 #: Triangles of a cluster, and clusters (or groups) of a group.
-CLUSTER, BRANCH = 32, 4
+CLUSTER, BRANCH = 16, 4
 
 
 class Frame(NamedTuple):
