@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from hybridve.hull.query.viewport import (
     MAX_VIEWPORT,
-    hit_positions,
     n_samples,
+    place_runs,
     sample_positions,
     sample_steps,
+    samples_before,
     viewports_for_accuracy,
 )
 
@@ -95,23 +96,19 @@ def test_hits_are_positioned_to_the_bits_of_the_specification(seed: int, largest
     viewports = rng.integers(1, largest + 1, 7).astype(np.int32)
     triangle = np.repeat(np.arange(7, dtype=np.uint32), [n_samples(int(u)) for u in viewports])
     sample = np.concatenate([np.arange(n_samples(int(u)), dtype=np.uint32) for u in viewports])
-    order = np.arange(len(triangle))
-    for chosen in (order, order[rng.random(len(order)) < 0.3], rng.permutation(order)):
-        expected = sample_positions(
-            vertices[faces[triangle[chosen]]], viewports[triangle[chosen]], sample[chosen]
-        )
-
-        found = [
-            hit_positions(
-                vertices,
-                faces,
-                viewports,
-                triangle[chosen],
-                sample[chosen],
-                np.zeros((len(chosen), 3), dtype),
+    before = samples_before(viewports)
+    some = np.flatnonzero(rng.random(len(triangle)) < rng.choice([0.05, 0.5, 0.95]))
+    for chosen in (np.arange(len(triangle)), some, some[:0]):
+        # As few runs as can be, and each sample a run of its own.
+        cuts = np.flatnonzero(np.diff(chosen) != 1) + 1
+        parts = [part for part in np.split(chosen, cuts) if len(part)]
+        longest = [[part[0] for part in parts], [part[-1] + 1 for part in parts]]
+        for start, stop in (np.array(longest, np.int64), np.stack([chosen, chosen + 1])):
+            expected = sample_positions(
+                vertices[faces[triangle[chosen]]], viewports[triangle[chosen]], sample[chosen]
             )
-            for dtype in (np.float64, np.float32)
-        ]
 
-        np.testing.assert_array_equal(found[0], expected)
-        np.testing.assert_array_equal(found[1], expected.astype(np.float32))
+            found = place_runs(start, stop, before, vertices, faces, viewports)
+
+            np.testing.assert_array_equal(found[0], triangle[chosen])
+            np.testing.assert_array_equal(found[1], expected.astype(np.float32))

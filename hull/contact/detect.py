@@ -18,7 +18,7 @@ from hybridve.hull.query.clusters import spatial_order
 from hybridve.hull.query.engine import Engine, Hits, Triangles
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.viewport import Real, hit_positions, viewports_for_accuracy
+from hybridve.hull.query.viewport import place_runs, sample_positions, viewports_for_accuracy
 
 #: "colliding": a point of the surface, the witness, is inside every silhouette. "free": proved, no
 #: point of the object is in the hull. "open": nothing as wide as `Contact.open_at_m` is. "": only
@@ -164,12 +164,14 @@ def _no_contact(certificate: Certificate) -> Contact:
 def _contact(hull: Hull, body: Body, hits: Hits) -> Contact:
     if len(hits) == 0:
         return _no_contact("")
-    triangle, sample = hits.samples()
-    points_world = _place(body, triangle, sample, np.zeros((len(triangle), 3), np.float32))
-    contact = Contact("", points_world, body.numbers[triangle])
+    points_world, numbers = collision_points(body, hits)
+    contact = Contact("", points_world, numbers)
     # An engine in single precision may err at the rim of a silhouette; a witness may not.
-    few = slice(0, _MAX_WITNESSES)
-    candidates_world = _place(body, triangle[few], sample[few], np.zeros((len(triangle[few]), 3)))
+    mesh = body.triangles
+    triangle, sample = hits.samples(_MAX_WITNESSES)
+    candidates_world = sample_positions(
+        mesh.vertices_world[mesh.faces[triangle]], mesh.viewports[triangle], sample
+    )
     inside = contains_points(hull, candidates_world)
     if not inside.any():
         return contact
@@ -177,16 +179,18 @@ def _contact(hull: Hull, body: Body, hits: Hits) -> Contact:
     return replace(contact, certificate="colliding", witness_world=witness_world)
 
 
-def _place(
-    body: Body,
-    triangle: NDArray[np.uint32],
-    sample: NDArray[np.uint32],
-    positions: NDArray[Real],
-) -> NDArray[Real]:
+def collision_points(body: Body, hits: Hits) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return where the samples of hits lie, (P, 3) metres, and each one's triangle of the scene."""
     mesh = body.triangles
-    return hit_positions(
-        mesh.vertices_world, mesh.faces, mesh.viewports, triangle, sample, positions
+    triangle, points_world = place_runs(
+        hits.start,
+        hits.stop,
+        mesh.topology.samples_before,
+        mesh.vertices_world,
+        mesh.faces,
+        mesh.viewports,
     )
+    return points_world, body.numbers[triangle]
 
 
 #: How many collision points are asked again in double precision for one that stands.

@@ -14,14 +14,10 @@ Samples are numbered row by row, j = 0 first: sample (i, j) is number ``j u - j 
 An engine returns numbers; positions come from here alone.
 """
 
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.jit import compiled
-
-Real = TypeVar("Real", np.float32, np.float64)
+from hybridve.hull.jit import ZERO, compiled
 
 #: More samples an edge than a 16-bit image is wide serve nobody, and their count stays below 2^31.
 MAX_VIEWPORT = 65_535
@@ -127,75 +123,6 @@ def viewports_for_accuracy(corners: NDArray[np.float64], accuracy_m: float) -> N
     return np.asarray(np.maximum(needed, 2), dtype=np.int32)
 
 
-def hit_positions(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    viewports: NDArray[np.int32],
-    triangle: NDArray[np.uint32],
-    sample: NDArray[np.uint32],
-    positions: NDArray[Real],
-) -> NDArray[Real]:
-    """Return where the samples of a mesh lie: `sample_positions`, compiled, to the same bits.
-
-    Parameters
-    ----------
-    vertices : (V, 3) float64
-        In any frame.
-    faces : (T, 3) int32
-        Vertex numbers.
-    viewports : (T,) int32
-        The viewport of each triangle.
-    triangle, sample : (P,) uint32
-        Triangles, and numbers of samples in their viewports.
-    positions : (P, 3) float64 or float32
-        Where to write them: millions of points cost more to allocate twice than to compute.
-
-    Returns
-    -------
-    (P, 3) float64 or float32
-        `positions`, in the frame of the vertices, computed in double precision.
-    """
-    _fill_positions(vertices, faces, viewports, triangle, sample, positions)
-    return positions
-
-
-@compiled
-def _fill_positions(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    viewports: NDArray[np.int32],
-    triangle: NDArray[np.uint32],
-    sample: NDArray[np.uint32],
-    positions: NDArray[Real],
-) -> None:
-    last = np.int64(-1)
-    row_end = j = np.int64(0)
-    for hit in range(len(triangle)):
-        t = np.int64(triangle[hit])
-        number = np.int64(sample[hit])
-        u = np.int64(viewports[t])
-        if t != last or number < row_end - (u - j):
-            last, j, row_end = t, np.int64(0), u
-        while number >= row_end:  # rows are short, and hits come in order
-            j += 1
-            row_end += u - j
-        i = number - (row_end - (u - j))
-        if u == 1:
-            for axis in range(3):
-                a, b, c = faces[t]
-                positions[hit, axis] = (
-                    vertices[a, axis] + vertices[b, axis] + vertices[c, axis]
-                ) / 3.0
-            continue
-        along, up = i / (u - 1.0), j / (u - 1.0)
-        a, b, c = faces[t]
-        for axis in range(3):
-            start = vertices[a, axis]
-            positions[hit, axis] = (
-                start + (vertices[b, axis] - start) * along + (vertices[c, axis] - start) * up
-            )
-
-
 @compiled
 def expand_runs(
     start: NDArray[np.int64],
@@ -215,18 +142,11 @@ def expand_runs(
     triangle, sample : (P,) uint32
         What is written.
     """
-    n, t = 0, 0
+    n, t = ZERO, ZERO
     for run in range(len(start)):
         number = start[run]
-        if number >= before[t + 1]:  # on to the triangle of this sample, by bisection
-            low, high = t + 1, len(before) - 1
-            while high - low > 1:
-                middle = (low + high) // 2
-                if before[middle] <= number:
-                    low = middle
-                else:
-                    high = middle
-            t = low
+        if number >= before[t + 1]:
+            t = _triangle_of(number, before, t + 1)
         while number < stop[run]:
             end = min(stop[run], before[t + 1])
             first = before[t]
@@ -236,6 +156,106 @@ def expand_runs(
                 n += 1
             if n == len(triangle):
                 return
+            number = end
+            if number == before[t + 1]:
+                t += 1
+
+
+def place_runs(
+    start: NDArray[np.int64],
+    stop: NDArray[np.int64],
+    before: NDArray[np.int64],
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    viewports: NDArray[np.int32],
+) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+    """Return triangles (P,) and positions (P, 3) of the samples of runs.
+
+    The positions are those of `sample_positions`, rounded once.
+
+    Parameters
+    ----------
+    start, stop : (R,) int64
+        Runs of samples, numbered through the mesh, ascending.
+    before : (T + 1,) int64
+        Samples of the triangles before each; see `samples_before`.
+    vertices : (V, 3) float64
+        In any frame.
+    faces : (T, 3) int32
+        Vertex numbers.
+    viewports : (T,) int32
+        The viewport of each triangle.
+    """
+    count = int((stop - start).sum())
+    triangle, positions = np.zeros(count, np.uint32), np.zeros((count, 3), np.float32)
+    _place_runs(start, stop, before, vertices, faces, viewports, triangle, positions)
+    return triangle, positions
+
+
+@compiled
+def _triangle_of(number: int, before: NDArray[np.int64], low: int) -> int:
+    """Return the triangle of a sample, which is `low` or a later one, by bisection."""
+    high = len(before) - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if before[middle] <= number:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@compiled
+def _place_runs(
+    start: NDArray[np.int64],
+    stop: NDArray[np.int64],
+    before: NDArray[np.int64],
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    viewports: NDArray[np.int32],
+    triangle: NDArray[np.uint32],
+    positions: NDArray[np.float32],
+) -> None:
+    n, t = ZERO, ZERO
+    shares = np.zeros(1)  # i / (u - 1) for all i, of the last viewport
+    for run in range(len(start)):
+        number = start[run]
+        if number >= before[t + 1]:
+            t = _triangle_of(number, before, t + 1)
+        while number < stop[run]:
+            end = min(stop[run], before[t + 1])
+            u = np.int64(viewports[t])
+            a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+            a_x, a_y, a_z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+            b_x, b_y, b_z = vertices[b, 0], vertices[b, 1], vertices[b, 2]
+            c_x, c_y, c_z = vertices[c, 0], vertices[c, 1], vertices[c, 2]
+            if u == 1:
+                triangle[n] = t
+                positions[n, 0] = (a_x + b_x + c_x) / 3.0
+                positions[n, 1] = (a_y + b_y + c_y) / 3.0
+                positions[n, 2] = (a_z + b_z + c_z) / 3.0
+                n += 1
+            else:
+                if len(shares) != u:
+                    shares = np.arange(u) / (u - 1.0)
+                j, row = ZERO, before[t]
+                while number >= row + u - j:  # the row that the run begins in
+                    row += u - j
+                    j += 1
+                while number < end:
+                    length = min(end, row + u - j) - number
+                    i, up = number - row, shares[j]
+                    up_x, up_y, up_z = (c_x - a_x) * up, (c_y - a_y) * up, (c_z - a_z) * up
+                    for k in range(length):
+                        along = shares[i + k]
+                        triangle[n + k] = t
+                        positions[n + k, 0] = a_x + (b_x - a_x) * along + up_x
+                        positions[n + k, 1] = a_y + (b_y - a_y) * along + up_y
+                        positions[n + k, 2] = a_z + (b_z - a_z) * along + up_z
+                    n += length
+                    number += length
+                    row += u - j
+                    j += 1
             number = end
             if number == before[t + 1]:
                 t += 1

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import DeviceError
-from hybridve.hull.contact.detect import Body, make_body
+from hybridve.hull.contact.detect import Body, collision_points, make_body
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.engine import Engine, Hits
-from hybridve.hull.query.viewport import hit_positions
 from hybridve.hull.report.sweep_file import EngineSweep, SweepFrames, SweepRows, TruthSettings
 from hybridve.hull.sweep.cost import fit_cost, window_px_read
 from hybridve.hull.sweep.frames import HullFrame
@@ -338,7 +337,9 @@ def _judge_row(
             against_proof += int((touched & (one.verdict == FREE)).sum())
             if one.collides and len(hits) == 0:
                 objects_missed += 1
-            reported_world = _place(row.bodies[index], hits)  # to warm up, even if it is known
+            reported_world, _ = collision_points(
+                row.bodies[index], hits
+            )  # to warm up, even if it is known
             true_world = np.concatenate([one.witnesses_world, one.dense_world])
             if len(hits) == 0 or len(true_world) == 0:
                 continue
@@ -378,24 +379,10 @@ def _answer_in_time(
         answers = _answer(room, frame, row)
         answered = clock()
         for index, hits in answers.items():
-            _place(row.bodies[index], hits)
+            collision_points(row.bodies[index], hits)
         query_s += answered - started
         place_s += clock() - answered
     return query_s / len(frames), place_s / len(frames)
-
-
-def _place(body: Body, hits: Hits) -> NDArray[np.float32]:
-    """Return where samples lie, as `detect` does it for its report."""
-    triangle, sample = hits.samples()
-    mesh = body.triangles
-    return hit_positions(
-        mesh.vertices_world,
-        mesh.faces,
-        mesh.viewports,
-        triangle,
-        sample,
-        np.zeros((len(triangle), 3), np.float32),
-    )
 
 
 def _count_work(frames: Sequence[HullFrame], rows: Sequence[Row], engines: list[str]) -> _Work:
