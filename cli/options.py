@@ -16,7 +16,9 @@ FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
 _path = click.Path(path_type=Path)
 
 
-class _Frames(click.ParamType["FrameRange"]):
+class Frames(click.ParamType["FrameRange"]):
+    """A range of frames, written as Python does."""
+
     name = "START:STOP[:STEP]"
 
     def convert(
@@ -55,7 +57,7 @@ overwrite_option = click.option(
 )
 frames_option = click.option(
     "--frames",
-    type=_Frames(),
+    type=Frames(),
     default=":",
     help="Which frames, as a Python range: 0:100, 100:, 0:400:10, or one: 7. Default: all.",
 )

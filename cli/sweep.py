@@ -77,7 +77,7 @@ class _CommaOption(click.Option):
 )
 @click.option(
     "--frames",
-    type=options._Frames(),
+    type=options.Frames(),
     help="Which frames, as a Python range: 0:100, 100:, 0:400:10, or one: 7. Default: at most 20, "
     "spread over the recording.",
 )
