@@ -24,6 +24,7 @@ class Frames(click.ParamType["FrameRange"]):
     def convert(
         self, value: str, param: click.Parameter | None, ctx: click.Context | None
     ) -> "FrameRange":
+        """Return the range, or fail with what was expected."""
         from hybridve.calib.errors import SessionError
         from hybridve.hull.capture.recording import FrameRange
 

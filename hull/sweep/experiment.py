@@ -337,9 +337,8 @@ def _judge_row(
             against_proof += int((touched & (one.verdict == FREE)).sum())
             if one.collides and len(hits) == 0:
                 objects_missed += 1
-            reported_world, _ = collision_points(
-                row.bodies[index], hits
-            )  # to warm up, even if it is known
+            # Done even where the answer is known already: to warm up.
+            reported_world, _ = collision_points(row.bodies[index], hits)
             true_world = np.concatenate([one.witnesses_world, one.dense_world])
             if len(hits) == 0 or len(true_world) == 0:
                 continue
