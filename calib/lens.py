@@ -4,11 +4,13 @@ COLMAP's models, evaluated by pycolmap, so that the hull and the solver can neve
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hybridve.calib.cache import cache_key, find_arrays, keep_arrays
 from hybridve.calib.camera import Camera
 
 #: An undistorted image reaches at most this far off the axis, in degrees: a pinhole image of a
@@ -21,6 +23,11 @@ _FOLD_TOLERANCE = 1e-4
 
 #: Rays per side from which the extent of an undistorted image is found.
 _EXTENT_STEPS = 65
+
+_KIND = "lenses"
+
+#: Part of the key of what is kept: count it up when `undistortion` computes something else.
+_VERSION = 1
 
 
 def _colmap_camera(camera: Camera) -> pycolmap.Camera:
@@ -102,10 +109,37 @@ def undistortion(camera: Camera) -> Undistortion:
     """Return the pinhole image that contains all that the camera sees, up to 70 degrees off axis.
 
     The focal lengths stay those of the lens, so that the middle of the image keeps its resolution.
+    Where the lens distorts, it is computed once and kept (see `hybridve.calib.cache`).
     """
-    pinhole = camera.pinhole
     if not camera.has_distortion:
-        return Undistortion(camera.width_px, camera.height_px, pinhole, None, None)
+        return Undistortion(camera.width_px, camera.height_px, camera.pinhole, None, None)
+    key = cache_key(
+        *(_VERSION, pycolmap.__version__, np.__version__),
+        *(MAX_HALF_ANGLE_DEG, _FOLD_TOLERANCE, _EXTENT_STEPS),
+        *(camera.model, camera.width_px, camera.height_px, camera.params.tobytes()),
+    )
+    kept = find_arrays(_KIND, key, ("img_from_cam", "map_x", "map_y"))
+    if kept is None or not _is_undistortion(*kept):
+        matrix, map_x, map_y = _undistort(camera)
+        keep_arrays(_KIND, key, img_from_cam=matrix, map_x=map_x, map_y=map_y)
+    else:
+        matrix, map_x, map_y = kept
+    return Undistortion(map_x.shape[1], map_x.shape[0], matrix, map_x, map_y)
+
+
+def _is_undistortion(matrix: NDArray[Any], map_x: NDArray[Any], map_y: NDArray[Any]) -> bool:
+    return (
+        (matrix.shape == (3, 3) and matrix.dtype == np.float64)
+        and (map_x.ndim == 2 and map_x.shape == map_y.shape)
+        and map_x.dtype == map_y.dtype == np.float32
+    )
+
+
+def _undistort(
+    camera: Camera,
+) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
+    """Return pinhole matrix and maps of the undistortion of a lens that distorts."""
+    pinhole = camera.pinhole
 
     # All that the image shows, as rays. A pixel without a ray of its own (outside the circle of a
     # fisheye, or beyond the radius where a fitted polynomial turns back) shows nothing.
@@ -143,10 +177,4 @@ def undistortion(camera: Camera) -> Undistortion:
     )
     maps = np.where(inside[:, None], sources - 0.5, -1.0).astype(np.float32)
     maps = maps.reshape(height_px, width_px, 2)
-    return Undistortion(
-        width_px,
-        height_px,
-        matrix,
-        np.ascontiguousarray(maps[..., 0]),
-        np.ascontiguousarray(maps[..., 1]),
-    )
+    return matrix, np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])

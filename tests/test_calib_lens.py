@@ -1,6 +1,7 @@
 """Cameras, lenses and poses: what goes out comes back, and what cannot be is refused."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hybridve.calib import lens
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import cam_from_img, img_from_cam, project_points, undistortion
@@ -132,6 +134,51 @@ def test_the_undistorted_image_holds_the_recorded_one_and_is_a_pinhole(model: st
     expected = img_from_cam(camera, np.linalg.solve(pinhole.img_from_cam, centers.T).T)
     mapped = np.column_stack([pinhole.map_x[rows, columns], pinhole.map_y[rows, columns]])
     np.testing.assert_allclose(mapped + 0.5, expected, atol=MAP_PX)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_an_undistortion_is_kept_to_the_bit(
+    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = make_camera("cam", model, POSE)
+    monkeypatch.setenv("HYBRIDVE_CACHE", "off")
+    computed = undistortion(camera)
+    monkeypatch.setenv("HYBRIDVE_CACHE", str(tmp_path))
+    undistortion(camera)
+    (entry,) = (tmp_path / "lenses").iterdir()
+    monkeypatch.setattr(lens, "_undistort", None)  # calling it raises TypeError
+
+    kept = undistortion(camera)
+
+    assert (kept.width_px, kept.height_px) == (computed.width_px, computed.height_px)
+    for name in ("img_from_cam", "map_x", "map_y"):
+        before, after = getattr(computed, name), getattr(kept, name)
+        assert (after.dtype, after.shape) == (before.dtype, before.shape)
+        assert after.tobytes() == before.tobytes()
+    np.savez(entry, img_from_cam=computed.img_from_cam, map_x=np.zeros(3), map_y=np.zeros(3))
+    with pytest.raises(TypeError):  # an entry of something else is none
+        undistortion(camera)
+
+
+def test_another_lens_is_another_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYBRIDVE_CACHE", str(tmp_path))
+    camera = make_camera("cam", "OPENCV", POSE)
+    others = [
+        replace(camera, width_px=camera.width_px + 1),
+        replace(camera, height_px=camera.height_px + 1),
+        replace(camera, params=camera.params * (1 + 1e-15)),
+        make_camera("cam", "RADIAL", POSE),
+    ]
+    elsewhere = replace(camera, name="other", cam_from_world=np.eye(3, 4))
+
+    for each in (*others, elsewhere):
+        undistortion(each)
+    widest = undistortion(camera)
+    monkeypatch.setattr(lens, "MAX_HALF_ANGLE_DEG", 20.0)
+    narrower = undistortion(camera)
+
+    assert narrower.width_px < widest.width_px
+    assert len(list((tmp_path / "lenses").iterdir())) == 1 + len(others) + 1
 
 
 def test_a_pinhole_needs_no_undistortion() -> None:

@@ -5,21 +5,17 @@ import os
 import struct
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.sessions import CUBE, write_ball_session, write_cube_scene
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
 from hybridve.hull.contact import mesh as mesh_module
-from hybridve.hull.contact import mesh_cache
 from hybridve.hull.contact.mesh import read_mesh
-from hybridve.hull.contact.mesh_cache import cache_folder, find_mesh, keep_mesh, mesh_key
+from hybridve.hull.contact.mesh_cache import find_mesh, mesh_key
 
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1 / 3]])
 FACES = np.array([[0, 2, 1], [0, 1, 3]], np.int32)
@@ -141,31 +137,6 @@ def test_another_open3d_reads_anew(
     assert len(entries(folder)) == 2
 
 
-@given(st.data())
-def test_a_damaged_entry_is_never_another_mesh_and_never_an_error(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HYBRIDVE_CACHE", str(tmp_path_factory.getbasetemp() / "damaged"))
-        key = mesh_key(b"", ".stl", "test")
-        keep_mesh(key, VERTICES, FACES)
-        folder = cache_folder()
-        assert folder is not None
-        path = folder / f"{key}.npz"
-        content = bytearray(path.read_bytes())
-        for _ in range(data.draw(st.integers(1, 3))):
-            content[data.draw(st.integers(0, len(content) - 1))] ^= data.draw(st.integers(1, 255))
-        length = data.draw(st.sampled_from([len(content), data.draw(st.integers(0, len(content)))]))
-        path.write_bytes(content[:length])
-
-        found = find_mesh(key)
-
-    # A byte that tells the time of writing may well change.
-    if found is not None:
-        np.testing.assert_array_equal(found[0], VERTICES)
-        np.testing.assert_array_equal(found[1], FACES)
-
-
 @pytest.mark.parametrize(
     ("vertices", "faces"),
     [
@@ -213,97 +184,6 @@ def test_where_nothing_can_be_kept_meshes_are_read_all_the_same(
     assert len(read_mesh(cube).faces) == 12
 
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_a_full_disk_leaves_no_trace(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_space(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(mesh_cache.os, "fdopen", no_space)
-
-    keep_mesh(mesh_key(b"", ".stl", "test"), VERTICES, FACES)
-
-    assert entries(folder) == []
-
-
-@pytest.mark.parametrize(
-    ("environment", "expected"),
-    [
-        ({"HYBRIDVE_CACHE": "/a"}, Path("/a/meshes")),
-        ({"HYBRIDVE_CACHE": "/a", "XDG_CACHE_HOME": "/b"}, Path("/a/meshes")),
-        ({"HYBRIDVE_CACHE": "off", "XDG_CACHE_HOME": "/b"}, None),
-        ({"HYBRIDVE_CACHE": "", "XDG_CACHE_HOME": "/b"}, None),
-        ({"XDG_CACHE_HOME": "/b", "HOME": "/c"}, Path("/b/hybridve/meshes")),
-        ({"XDG_CACHE_HOME": "b", "HOME": "/c"}, Path("/c/.cache/hybridve/meshes")),
-        ({"HOME": "/c"}, Path("/c/.cache/hybridve/meshes")),
-    ],
-)
-def test_the_environment_says_where_meshes_are_kept(
-    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], expected: Path | None
-) -> None:
-    for name in ("HYBRIDVE_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-
-    assert cache_folder() == expected
-
-
-def test_what_was_not_used_for_longest_goes_first(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    keys = [mesh_key(bytes([number]), ".stl", "test") for number in range(4)]
-    for age, key in enumerate(keys[:3]):
-        keep_mesh(key, VERTICES, FACES)
-        os.utime(folder / f"{key}.npz", (1e9 + age, 1e9 + age))
-    size_b = (folder / f"{keys[0]}.npz").stat().st_size
-    (folder / "somebody_elses.npz").write_bytes(b"\0" * 10 * size_b)
-    monkeypatch.setattr(mesh_cache, "LIMIT_B", 3 * size_b)
-
-    assert find_mesh(keys[0]) is not None  # the oldest, but now the last that was used
-    keep_mesh(keys[3], VERTICES, FACES)
-
-    kept = [key for key in keys if find_mesh(key) is not None]
-    assert kept == [keys[0], keys[2], keys[3]]
-    assert "somebody_elses.npz" in entries(folder)
-
-
-def test_what_an_interrupted_writer_left_goes_in_its_turn(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left, key = mesh_key(b"left", ".stl", "test"), mesh_key(b"new", ".stl", "test")
-    folder.mkdir(parents=True)
-    (folder / f"{left}.npz.a1b2c3").write_bytes(b"\0" * 5000)
-    os.utime(folder / f"{left}.npz.a1b2c3", (1e9, 1e9))
-    monkeypatch.setattr(mesh_cache, "LIMIT_B", 5000)
-
-    keep_mesh(key, VERTICES, FACES)
-
-    assert entries(folder) == [f"{key}.npz"]
-
-
-def test_a_mesh_larger_than_the_limit_drives_nothing_out(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small, large = mesh_key(b"small", ".stl", "test"), mesh_key(b"large", ".stl", "test")
-    keep_mesh(small, VERTICES, FACES)
-    monkeypatch.setattr(mesh_cache, "LIMIT_B", 3000)
-
-    keep_mesh(large, np.zeros((1000, 3)), FACES)
-
-    assert entries(folder) == [f"{small}.npz"]
-
-
-def test_many_writers_of_one_mesh_leave_one_whole_entry(folder: Path) -> None:
-    key = mesh_key(b"", ".stl", "test")
-
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda _: keep_mesh(key, VERTICES, FACES), range(64)))
-
-    assert entries(folder) == [f"{key}.npz"]
-    found = find_mesh(key)
-    assert found is not None
-    np.testing.assert_array_equal(found[0], VERTICES)
 
 
 def test_a_mesh_that_may_lean_on_another_file_is_not_kept(folder: Path, tmp_path: Path) -> None:
