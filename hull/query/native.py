@@ -500,6 +500,9 @@ def _query(
             for tile_i in range(tiles_per_edge - tile_j):
                 bits = (words[first_word + tile_i] >> shift) & np.uint64(255)
                 number = row_start + 8 * tile_i
+                if bits == np.uint64(255):
+                    runs, n_runs = _appended(number, number + 8, runs, n_runs)
+                    continue
                 while bits:
                     if bits & np.uint64(1):
                         runs, n_runs = _appended(number, number + 1, runs, n_runs)
