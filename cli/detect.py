@@ -70,13 +70,13 @@ def detect(
         raise click.UsageError("give either --viewport or --accuracy-mm, not both")
     import cv2
 
-    from hybridve.calib.rig_io import rig_to_dict
     from hybridve.cli.summary import print_summary
     from hybridve.hull.capture.session import load_session
     from hybridve.hull.contact.scene import load_scene
     from hybridve.hull.evaluate import (
         EvaluateSettings,
         about_objects,
+        about_rig,
         count_frames,
         evaluate,
         make_chain,
@@ -103,7 +103,7 @@ def detect(
             command=" ".join(["hybridve", *sys.argv[1:]]),
             objects=about_objects(chain),
             settings=resolved_settings(chain),
-            rig=rig_to_dict(chain.rig),
+            rig=about_rig(chain),
             engine=query.name,
             renderer=query.renderer,
             versions=software_versions(),

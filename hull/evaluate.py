@@ -18,7 +18,9 @@ import numpy as np
 
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.calib.lens import Undistortion, undistortion
+from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig
+from hybridve.calib.rig_io import rig_to_dict
 from hybridve.hull.capture.recording import (
     FrameRange,
     FrameSilhouettes,
@@ -238,6 +240,23 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "silhouettes": None if chain.silhouettes is None else str(chain.silhouettes),
         "local_origin_m": chain.views.origin_world.tolist(),
     }
+
+
+def about_rig(chain: Chain) -> dict[str, Any]:
+    """Return the rig as in rig.json, and how far undistorting can shift each silhouette.
+
+    ``mask_shift_px`` is the bound of `hybridve.calib.lens_bound` in recorded pixels; None for a
+    camera that the session does not use, or of which no bound is known.
+    """
+    shift_px = {
+        camera.name: lens_shift_px(chain.rig[camera.name], lens)
+        for camera, lens in zip(chain.session.cameras, chain.undistortions, strict=True)
+    }
+    about = rig_to_dict(chain.rig)
+    for entry in about["cameras"]:
+        shift = shift_px.get(entry["name"], np.inf)
+        entry["mask_shift_px"] = shift if np.isfinite(shift) else None
+    return about
 
 
 def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
