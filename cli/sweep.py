@@ -343,8 +343,10 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
         click.echo("  " + "  ".join(cells).rstrip())
     for engine in found["engines"]:
         click.echo(f"  {engine['name']}: {_cost_text(engine['name'], engine['cost'])}")
-    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in found["stage_ms_mean"].items())
-    click.echo(f"  once a frame, ms mean: {stages}")
+    stages = ", ".join(
+        f"{stage} {ms['median']:.2f} ({ms['iqr']:.2g})" for stage, ms in found["stage_ms"].items()
+    )
+    click.echo(f"  once a frame, ms, median over the frames (IQR): {stages}")
 
 
 def _mm(metres: float | None) -> str:

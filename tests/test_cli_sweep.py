@@ -52,6 +52,9 @@ def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     assert printed.pop("sweep") == str(tmp_path / "sweep.h5")
     assert printed.pop("picture") == str(tmp_path / "sweep.png")
     assert printed == json.loads(json.dumps(sweep_as_dict(sweep)))
+    hull_ms = 1e3 * sweep.frames.hull_s
+    assert printed["stage_ms"]["hull"]["median"] == pytest.approx(np.median(hull_ms))
+    assert (hull_ms > 0).all()
     assert printed["frames"] == [18, 22]
     assert [engine["name"] for engine in printed["engines"]] == ["native", "reference"]
     native, reference = printed["engines"]

@@ -466,6 +466,11 @@ def _attributes(group: h5py.Group) -> dict[str, Any]:
     }
 
 
+def _median_and_iqr(values: NDArray[np.float64]) -> dict[str, float]:
+    first, median, third = np.percentile(values, [25, 50, 75]).tolist()
+    return {"median": median, "iqr": third - first}
+
+
 def sweep_as_dict(sweep: Sweep) -> dict[str, Any]:
     """Return what a sweep found, as plain JSON values; numbers that are not there are None."""
     rows, frames = sweep.rows, sweep.frames
@@ -477,8 +482,8 @@ def sweep_as_dict(sweep: Sweep) -> dict[str, Any]:
         "created_utc": sweep.created_utc,
         "frames": frames.index.tolist(),
         "cameras": sweep.cameras,
-        "stage_ms_mean": {
-            stage: 1e3 * float(np.mean(getattr(frames, f"{stage}_s")))
+        "stage_ms": {
+            stage: _median_and_iqr(1e3 * getattr(frames, f"{stage}_s"))
             for stage in ("decode", "segment", "hull", "boxes", "certify", "sample")
         },
         "truth": {

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Generator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,11 +96,7 @@ def read_hulls(
             if frame.masks is None:
                 _log.warning("frame %d is left out: %s", frame.index, frame.reason)
                 continue
-            started = time.perf_counter()
             hull = make_hull(chain.views, frame.masks)
-            made = time.perf_counter()
-            near = near_bodies(hull, chain.bodies)
-            asked = time.perf_counter()
             n_bytes += hull.masks_flat.nbytes + hull.integrals_flat.nbytes
             if n_bytes > _MOST_BYTES:
                 raise SessionError(
@@ -111,11 +107,11 @@ def read_hulls(
                 HullFrame(
                     frame.index,
                     hull,
-                    near,
+                    near_bodies(hull, chain.bodies),
                     frame.decode_s,
                     frame.segment_s,
-                    made - started,
-                    asked - made,
+                    0.0,
+                    0.0,
                 )
             )
     if not frames:
@@ -123,7 +119,17 @@ def read_hulls(
             f"{chain.session.path}: none of the frames {chain.settings.frames} can be evaluated; "
             "choose others with --frames"
         )
-    return frames
+    return [_timed(frame, chain) for frame in frames]
+
+
+def _timed(frame: HullFrame, chain: Chain) -> HullFrame:
+    """Return a frame with the seconds of its hull and boxes, now that nothing else runs."""
+    masks = [frame.hull.mask(camera) for camera in range(len(chain.views))]
+    started = time.perf_counter()
+    hull = make_hull(chain.views, masks)
+    made = time.perf_counter()
+    near_bodies(hull, chain.bodies)
+    return replace(frame, hull_s=made - started, boxes_s=time.perf_counter() - made)
 
 
 def near_bodies(hull: Hull, bodies: list[Body]) -> NDArray[np.bool_]:
