@@ -44,7 +44,13 @@ def distance_to_cube_surface_m(center: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    "engine", ["native", "reference", pytest.param("compute", marks=pytest.mark.gl)]
+    "engine",
+    [
+        "native",
+        "reference",
+        pytest.param("compute", marks=pytest.mark.gl),
+        pytest.param("stencil", marks=pytest.mark.gl),
+    ],
 )
 def test_every_frame_in_which_the_ball_meets_the_surface_collides(
     run: Run, tmp_path: Path, session: Path, scene: Path, engine: str

@@ -11,7 +11,14 @@ from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.viewport import sample_positions
 
 
-@pytest.fixture(params=["reference", "native", pytest.param("compute", marks=pytest.mark.gl)])
+@pytest.fixture(
+    params=[
+        "reference",
+        "native",
+        pytest.param("compute", marks=pytest.mark.gl),
+        pytest.param("stencil", marks=pytest.mark.gl),
+    ]
+)
 def engine(request: pytest.FixtureRequest) -> Iterator[Engine]:
     with open_engine(request.param) as engine:
         yield engine

@@ -116,7 +116,13 @@ def test_runs_hold_the_samples_they_were_made_of(
 
 
 @pytest.mark.parametrize(
-    "name", ["reference", "native", pytest.param("compute", marks=pytest.mark.gl)]
+    "name",
+    [
+        "reference",
+        "native",
+        pytest.param("compute", marks=pytest.mark.gl),
+        pytest.param("stencil", marks=pytest.mark.gl),
+    ],
 )
 def test_an_engine_is_opened_by_name(name: str) -> None:
     with open_engine(name) as engine:

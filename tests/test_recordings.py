@@ -167,27 +167,36 @@ def test_the_person_sits_on_the_floor_and_is_as_tall_as_a_person(horseman: Path)
 
 def test_horseman_engines_find_the_same(run: Run, horseman: Path, tmp_path: Path) -> None:
     scene = DATA / "horseman" / "scene.toml"
-    frames = {"native": ":", "compute": ":", "reference": "0::50"}
-    counts = {}
+    frames = {"native": ":", "compute": ":", "stencil": "0::10", "reference": "0::50"}
+    counts, certificates = {}, {}
     for engine, chosen in frames.items():
         path = tmp_path / f"{engine}.h5"
         arguments = ["--scene", scene, "-o", path, "--engine", engine, "--frames", chosen]
         assert run("detect", horseman, *arguments, "--viewport", 6, "--no-progress") == 0
         report = read_report(path)
         counts[engine] = {name: rows.n_points for name, rows in report.objects.items()}
-    native, compute, reference = (counts[engine] for engine in frames)
+        certificates[engine] = {name: rows.certificate for name, rows in report.objects.items()}
+    native, compute, stencil, reference = (counts[engine] for engine in frames)
 
     assert len(native["forearm"]) == 426
     for name in native:
         # Samples within 1e-3 px of a pixel edge may differ: some of ten thousand.
-        difference = np.abs(native[name].astype(int) - compute[name].astype(int))
-        assert (difference <= 1e-3 * native[name] + 1).all(), name
-        assert difference.sum() <= 1e-4 * native[name].sum() + 1, name
+        for other, found in ((compute, native[name]), (stencil, native[name][::10])):
+            difference = np.abs(found.astype(int) - other[name].astype(int))
+            assert (difference <= 1e-3 * found + 1).all(), name
+            assert difference.sum() <= 1e-4 * found.sum() + 1, name
         np.testing.assert_array_equal(native[name][::50], reference[name])
+        # What is certain does not depend on the engine.
+        for engine, step in (("compute", 1), ("stencil", 10), ("reference", 50)):
+            expected = certificates["native"][name][::step]
+            np.testing.assert_array_equal(certificates[engine][name], expected)
     touched = {name for name, found in native.items() if found.any()}
     assert {"forearm", "wrist1"} <= touched
     assert not {"base", "shoulder", "upperarm", "wrist3"} & touched
     assert native["forearm"].all(), "it runs through the shoulders of a sitting person"
+    assert (certificates["native"]["forearm"] == "colliding").all()
+    for name in ("base", "shoulder", "upperarm", "wrist3"):
+        assert (certificates["native"][name] == "free").all(), name
 
 
 def test_collision_points_lie_in_the_hull(run: Run, horseman: Path, tmp_path: Path) -> None:
