@@ -22,8 +22,7 @@ releases it in the thread that owns the context (an object released twice breaks
 
 import weakref
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -35,10 +34,11 @@ from hybridve.hull.query.device import (
     compile_compute,
     is_software_renderer,
     load_shader,
+    make_current,
     open_device,
     renderer_name,
 )
-from hybridve.hull.query.engine import Hits, Topology, Triangles
+from hybridve.hull.query.engine import Closing, Hits, Topology, Triangles
 from hybridve.hull.query.silhouettes import Hull, Views
 
 #: Triangles of a cluster: CLUSTER in the shaders, a multiple of their GROUP. Of 32, 64, 128 and 256
@@ -144,7 +144,7 @@ class _Programs:
     sample: moderngl.ComputeShader
 
 
-class Compute:
+class Compute(Closing):
     """The volume query on an OpenGL device.
 
     It belongs to the thread that made it.
@@ -192,7 +192,7 @@ class Compute:
 
     def query(self, hull: Hull, meshes: list[Triangles]) -> list[Hits]:
         """Return for each mesh its samples inside the hull of this frame."""
-        self._make_current()
+        make_current(self._context)
         for surface in self._surfaces.values():
             surface.find_spare()
         self._context.gc()  # what belonged to meshes that are gone
@@ -218,7 +218,7 @@ class Compute:
         if self._is_closed:
             return
         self._is_closed = True
-        self._make_current()
+        make_current(self._context)
         self._surfaces.clear()
         self._placements.clear()
         self._programs.clear()
@@ -228,26 +228,6 @@ class Compute:
         self._context.gc()
         if self._owns_context:
             self._context.release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def _make_current(self) -> None:
-        """Take the thread's OpenGL commands; another engine may have had them since.
-
-        Not left again at the end: through EGL, that would leave none current, and so break who
-        does not ask.
-        """
-        context: Any = self._context  # whose stub leaves its methods of this kind untyped
-        context.__enter__()
 
     def _reserve(self, size: int) -> moderngl.Buffer:
         return self._context.buffer(reserve=size, dynamic=True)
@@ -272,7 +252,7 @@ class Compute:
         DeviceError
             If the driver does not.
         """
-        self._make_current()
+        make_current(self._context)
         room = _room(n_cameras)
         if room not in self._programs:
             rectangle = f"#define N_CAMERAS {room}\n" + load_shader("rectangle.glsl")

@@ -48,6 +48,16 @@ def open_device(device_index: int | None = None) -> moderngl.Context:
     return context
 
 
+def make_current(context: moderngl.Context) -> None:
+    """Take the thread's OpenGL commands for a context; another one may have had them since.
+
+    Not left again at the end: through EGL, that would leave none current, and so break who does
+    not ask.
+    """
+    enter: Any = context  # whose stub leaves its methods of this kind untyped
+    enter.__enter__()
+
+
 def renderer_name(context: moderngl.Context) -> str:
     """Return what draws, as OpenGL names it."""
     return str(context.info["GL_RENDERER"])

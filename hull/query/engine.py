@@ -203,6 +203,25 @@ class Hits:
         return triangle, sample
 
 
+class Closing:
+    """What a ``with`` statement closes at its end."""
+
+    def close(self) -> None:
+        """Release what is held."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
 class Engine(Protocol):
     """What answers the volume query.
 

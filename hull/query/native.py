@@ -10,8 +10,7 @@ what was rejected beforehand.
 
 import itertools
 from collections.abc import Callable
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled, inlined
 from hybridve.hull.query.clusters import make_frame, make_shares
-from hybridve.hull.query.engine import Hits, Triangles
+from hybridve.hull.query.engine import Closing, Hits, Triangles
 from hybridve.hull.query.rectangles import (
     ACCEPTS,
     REJECTS,
@@ -512,7 +511,7 @@ def _query(
     return runs[:n_runs]
 
 
-class Native:
+class Native(Closing):
     """The volume query in compiled loops on the CPU.
 
     Parameters
@@ -551,17 +550,6 @@ class Native:
     def close(self) -> None:
         """End the threads; a later query starts them again."""
         self._threads.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def _joined(mesh: Triangles, parts: list[NDArray[np.int64]]) -> Hits:

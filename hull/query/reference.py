@@ -4,13 +4,10 @@ Plain rather than fast. The other engines are tested against it; so is the recta
 `hybridve.hull.query.bounds`, which this room does not use.
 """
 
-from types import TracebackType
-from typing import Self
-
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.query.engine import Hits, Triangles
+from hybridve.hull.query.engine import Closing, Hits, Triangles
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import sample_positions
 
@@ -74,7 +71,7 @@ def _look(
     return seen, on_object
 
 
-class Reference:
+class Reference(Closing):
     """The engine that asks `contains_points` of every sample."""
 
     name = "reference"
@@ -88,17 +85,6 @@ class Reference:
 
     def close(self) -> None:
         """Release nothing: there is nothing to release."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def _query_mesh(hull: Hull, mesh: Triangles) -> Hits:

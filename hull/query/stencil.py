@@ -29,8 +29,7 @@ Objects on the device are dropped, never released by name: moderngl queues what 
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -38,8 +37,13 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.jit import compiled
-from hybridve.hull.query.device import compile_program, open_device, renderer_name
-from hybridve.hull.query.engine import Hits, Topology, Triangles
+from hybridve.hull.query.device import (
+    compile_program,
+    make_current,
+    open_device,
+    renderer_name,
+)
+from hybridve.hull.query.engine import Closing, Hits, Topology, Triangles
 from hybridve.hull.query.silhouettes import Hull, Views
 
 #: Pixels a side of the window, if not told otherwise. The paper had 400 x 400. To a software
@@ -121,7 +125,7 @@ class _Placed:
     first_row: int
 
 
-class Stencil:
+class Stencil(Closing):
     """The paper's volume query on an OpenGL device.
 
     It belongs to the thread that made it.
@@ -198,7 +202,7 @@ class Stencil:
             If there are more cameras than the counter of a pixel can count.
         """
         lowest, highest = self._inside_counts(hull.views)
-        self._make_current()
+        make_current(self._context)
         self._context.gc()  # what belonged to meshes that are gone
         if hull is not self._hull:
             self._upload_hull(hull)
@@ -228,31 +232,12 @@ class Stencil:
         if self._is_closed:
             return
         self._is_closed = True
-        self._make_current()
+        make_current(self._context)
         for name in ("_meshes", "_programs", "_windows", "_increments", "_hull", "_views"):
             self.__dict__.pop(name, None)  # some are missing where the constructor failed
         self._context.gc()
         if self._owns_context:
             self._context.release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def _make_current(self) -> None:
-        """Take the thread's OpenGL commands; another engine may have had them since.
-
-        As in `hybridve.hull.query.compute`, they are not handed back.
-        """
-        context: Any = self._context  # whose stub leaves its methods of this kind untyped
-        context.__enter__()
 
     def _inside_counts(self, views: Views) -> tuple[int, int]:
         """Return between which counts a pixel is inside the hull."""

@@ -5,8 +5,6 @@ Drawn in layers at twice the picture's size in each direction, put together by
 """
 
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self
 
 import cv2
 import moderngl
@@ -15,7 +13,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.rig import Rig
-from hybridve.hull.query.device import open_device
+from hybridve.hull.query.device import make_current, open_device
+from hybridve.hull.query.engine import Closing
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import Cells
 from hybridve.hull.view.drawn import DrawnObject, thinned
@@ -189,7 +188,7 @@ class PaintedScene:
     floor: Floor
 
 
-class Painter:
+class Painter(Closing):
     """Draws scenes; keeps what is compiled from one picture to the next.
 
     The context belongs to the thread that opened it.
@@ -223,19 +222,9 @@ class Painter:
         if self._owned:
             self._device.release()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
     def paint(self, scene: PaintedScene, view: NovelView, size_px: tuple[int, int]) -> Image:
         """Return the scene as seen by `view`, (H, W, 3) BGR."""
+        make_current(self._device)
         try:
             picture = self._paint(scene, view, (size_px[0] * _SAMPLES, size_px[1] * _SAMPLES))
         finally:
