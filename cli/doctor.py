@@ -3,6 +3,7 @@
 import ctypes.util
 import json
 import sys
+import time
 from typing import Any
 
 import click
@@ -19,19 +20,29 @@ _LIBRARIES = {
 
 
 @click.command(short_help="Tell what this machine has.")
+@click.option(
+    "--prepare", is_flag=True, help="Compile for this machine now what the first detect would."
+)
 @options.json_option
-def doctor(as_json: bool) -> None:
+def doctor(prepare: bool, as_json: bool) -> None:
     """Tell what this machine has: OpenGL renderer, threads, versions, and what is missing.
+
+    With --prepare, the loops of the query are compiled, if they are not yet: some ten seconds that
+    the first detect need not wait. They are kept in ~/.cache/hybridve, or where HYBRIDVE_CACHE
+    says.
 
     Leaves with status 1 if something that detect needs is missing.
     """
-    found = examine()
+    prepare_s = _prepare() if prepare else None
+    found = examine() | {"prepare_s": prepare_s}
     if as_json:
         click.echo(json.dumps(found))
     else:
         click.echo(f"machine    {found['machine']}")
         click.echo(f"opengl     {found['opengl'] or 'none: ' + found['opengl_problem']}")
         click.echo(f"engine     {found['engine']} (what --engine auto takes here)")
+        ready = "compiled" if found["compiled"] else "compiled in the first detect, or by --prepare"
+        click.echo(f"query      {ready}" + (f" ({prepare_s:.1f} s)" if prepare_s else ""))
         for package, number in found["versions"].items():
             click.echo(f"{package:24}{number}")
         for problem in found["problems"]:
@@ -42,9 +53,19 @@ def doctor(as_json: bool) -> None:
         sys.exit(1)
 
 
+def _prepare() -> float:
+    """Compile what detect needs, and return how many seconds that took."""
+    from hybridve.hull.prepare import prepare_kernels
+
+    started = time.perf_counter()
+    prepare_kernels()
+    return time.perf_counter() - started
+
+
 def examine() -> dict[str, Any]:
     """Return what the machine has, as plain JSON values."""
     from hybridve.calib.errors import DeviceError
+    from hybridve.hull.prepare import is_prepared
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.query.device import open_device
     from hybridve.hull.report.machine import machine_text, n_threads, software_versions
@@ -73,6 +94,7 @@ def examine() -> dict[str, Any]:
         "opengl": f"{renderer}, {gl_version}" if renderer else "",
         "opengl_problem": opengl_problem,
         "engine": chosen,
+        "compiled": is_prepared(),
         "versions": software_versions(),
         "problems": problems,
     }

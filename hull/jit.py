@@ -1,42 +1,87 @@
 """Compilation of numerical loops, typed.
 
 numba ships no types, so its decorator is wrapped once here. Functions release the GIL, so that
-plain Python threads run them side by side, and are kept on disk, so that only the first start
-after an install compiles. Division by zero gives infinity, as in NumPy.
+plain Python threads run them side by side, and are kept on disk, so that nothing compiles after
+the first time (see `hybridve.hull.prepare`). Division by zero gives infinity, as in NumPy.
 
 numba notices when the file of a function changes, but not when a function that it calls does, in
-another file. So what is kept lies in a folder named after all sources that are compiled.
+another file. So what is kept lies in a folder named after all sources that are compiled, in
+``compiled`` of the cache (see `hybridve.calib.cache`), or in ``NUMBA_CACHE_DIR`` where that is set.
 """
 
 import hashlib
 import logging
 import os
+import shutil
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import llvmlite.binding
 import numba
 import numpy as np
+
+from hybridve.calib.cache import cache_folder
 
 _logger = logging.getLogger(__name__)
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+#: Code that no start has used for so long is removed, in seconds: its sources have changed.
+_FORGOTTEN_AFTER_S = 30 * 24 * 3600.0
 
-def _kept_under() -> Path:
-    """Return the folder of compiled code that belongs to the sources as they are."""
+_DIGITS = 16
+
+
+def open_folder() -> Path | None:
+    """Return the folder of compiled code for these sources on this machine; None for none.
+
+    It is made where there is none. Folders of other sources that are not used any more go then.
+    """
+    users = numba.config.CACHE_DIR
+    base = Path(users) if users else cache_folder("compiled")
+    if base is None:
+        return None
+    folder = base / _digest()
+    try:
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            if not users:
+                _drop_forgotten(base)
+        os.utime(folder)  # the time of last use
+    except OSError as error:
+        _logger.warning("compiled code is not kept for the next start: %s", error)
+        return None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        # numba would turn to __pycache__, where it does not notice changes of other files.
+        _logger.warning("compiled code is not kept for the next start: %s is read-only", folder)
+        return None
+    return folder
+
+
+def _digest() -> str:
     digest = hashlib.sha256()
     for source in sorted(Path(__file__).parent.rglob("*.py")):
         text = source.read_bytes()
         if b"hull.jit import" in text:
             digest.update(text)
-    base = numba.config.CACHE_DIR
-    if not base:
-        users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-        base = Path(users).expanduser() / "hybridve" / "compiled"
-    return Path(base) / digest.hexdigest()[:16]
+    digest.update(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
+    return digest.hexdigest()[:_DIGITS]
 
 
-numba.config.CACHE_DIR = str(_kept_under())
+def _drop_forgotten(base: Path) -> None:
+    """Remove folders of compiled code that were not used for long."""
+    for folder in base.glob("[0-9a-f]" * _DIGITS):
+        with suppress(OSError):  # another process was faster
+            if time.time() - folder.stat().st_mtime > _FORGOTTEN_AFTER_S:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+#: Where compiled code is kept, or None.
+FOLDER = open_folder()
+if FOLDER is not None:
+    numba.config.CACHE_DIR = str(FOLDER)
 
 #: A zero to begin counts with. For one written out, numba compiles what takes it a second time.
 ZERO = cast(int, np.int64(0))
@@ -53,9 +98,8 @@ def inlined(function: _Function) -> _Function:
 
 
 def _compile(function: _Function, **options: bool) -> _Function:
-    try:
-        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    except RuntimeError as error:  # the folder cannot be written to
-        _logger.warning("compiled code is not kept for the next start: %s", error)
-        dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    keep = FOLDER is not None
+    dispatcher = numba.njit(
+        cache=keep, nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options
+    )(function)
     return cast("_Function", dispatcher)

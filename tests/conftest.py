@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from hybridve.calib.cache import cache_folder
+
 PROJECT = Path(__file__).resolve().parent.parent
 
 # Machines are noisy, and compiled code compiles in its first example: no example has a time limit.
@@ -19,8 +21,14 @@ settings.load_profile("project")
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep meshes that tests read away from the user's; for the session, as fixtures read too."""
+    """Keep what tests keep away from the user's, for the session, as fixtures keep things too.
+
+    Compiled code is the user's own: it takes long, and is named after its sources.
+    """
     with pytest.MonkeyPatch.context() as patch:
+        compiled = cache_folder("compiled")
+        if compiled is not None and "NUMBA_CACHE_DIR" not in os.environ:
+            patch.setenv("NUMBA_CACHE_DIR", str(compiled))
         patch.setenv("HYBRIDVE_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
 

@@ -90,7 +90,8 @@ def _summarise(
     n_frames = values.shape[0]
     counts = np.zeros(256, np.int64)
     for place in range(values.shape[1]):
-        counts[:] = 0
+        for level in range(256):  # a loop: compiling a slice takes long
+            counts[level] = 0
         for frame in range(n_frames):
             counts[values[frame, place]] += 1
         median = 0

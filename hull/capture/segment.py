@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SessionError
 from hybridve.calib.image_io import Image
 from hybridve.hull.capture.background import Background
-from hybridve.hull.jit import compiled
+from hybridve.hull.jit import ZERO, compiled
 
 #: About how many pixels the camera's gain looks at.
 _GAIN_PIXELS = 2000
@@ -278,16 +278,10 @@ def clean(mask: NDArray[np.uint8], speck_px: int, hole_px: int) -> NDArray[np.ui
         1 on object pixels.
     """
     result = mask.copy()
-    objects = _bounded(result)
-    _flip_small(objects, 1, speck_px)
-    _flip_small(_bounded(objects), 0, hole_px)
+    for value, least_px in ((1, speck_px), (0, hole_px)):
+        left, top, width, height = cv2.boundingRect(result)
+        _flip_small(result, left, top, width, height, value, least_px)
     return result
-
-
-def _bounded(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the part of a mask within the bounding rectangle of its objects, not a copy."""
-    left, top, width, height = cv2.boundingRect(mask)
-    return mask[top : top + height, left : left + width]
 
 
 def threshold_mask(image: Image, threshold: int = 127) -> NDArray[np.uint8]:
@@ -402,8 +396,8 @@ def _weigh(
             stop += 1
         left = max(places[start, 1] - _SHADE_REACH_PX, 0)
         right = min(places[stop - 1, 1] + _SHADE_REACH_PX + 1, width)
-        trusts[left + _SHADE_REACH_PX : right + _SHADE_REACH_PX] = 0
-        shades[left + _SHADE_REACH_PX : right + _SHADE_REACH_PX] = 0
+        for column in range(left + _SHADE_REACH_PX, right + _SHADE_REACH_PX):
+            trusts[column] = shades[column] = 0
         for other in range(max(row - _SHADE_REACH_PX, 0), min(row + _SHADE_REACH_PX + 1, height)):
             for column in range(left, right):
                 value = trust[other, column]
@@ -431,8 +425,9 @@ def _weigh(
                 n_counted += 1
 
     weight = _COLOUR_WEIGHT * n_counted / (n_counted + _COLOUR_PIXELS)
-    likelier = np.full(_N_COLOURS, np.float32(np.log(1.0 - weight)), np.float32)
+    unseen, likelier = np.float32(np.log(1.0 - weight)), np.zeros(_N_COLOURS, np.float32)
     for colour in range(_N_COLOURS):
+        likelier[colour] = unseen
         if counts[colour] > 0:
             share = counts[colour] * _N_COLOURS / n_counted
             likelier[colour] = np.log(weight * share + 1.0 - weight)
@@ -456,43 +451,53 @@ def _colour(image: NDArray[np.uint8], row: int, column: int) -> int:
 
 
 @compiled
-def _flip_small(mask: NDArray[np.uint8], value: int, least_px: int) -> None:
+def _flip_small(
+    mask: NDArray[np.uint8],
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+    value: int,
+    least_px: int,
+) -> None:
     """Turn the pieces of `value` (0 or 1) with fewer than `least_px` pixels into the other.
 
-    Pieces of 1 hang together across corners, those of 0 do not; pieces of 0 at the border of the
-    mask stay. Runs of equal pixels along the rows are joined, which takes little time where
-    silhouettes are few and smooth.
+    Only within a rectangle of the mask, which may be empty. Pieces of 1 hang together across
+    corners, those of 0 do not; pieces of 0 at the border of the rectangle stay. Runs of equal
+    pixels along the rows are joined, which takes little time where silhouettes are few and smooth.
     """
-    height, width = mask.shape
+    right, bottom = left + width, top + height
     n_runs = 0
-    for row in range(height):
+    for row in range(top, bottom):
         before = 1 - value
-        for column in range(width):
+        for column in range(left, right):
             if mask[row, column] == value != before:
                 n_runs += 1
             before = mask[row, column]
     runs = np.zeros((n_runs, 3), np.int32)  # row, first column, column after the last
-    parent = np.arange(n_runs)
-    area = np.zeros(n_runs, np.int64)
+    parent, area = np.zeros(n_runs, np.int64), np.zeros(n_runs, np.int64)
+    for run in range(n_runs):
+        parent[run] = run
     reach = value  # how far beyond its ends a run touches those in the row above
-    run = 0
-    above = 0  # the first run in the row above that may touch
-    above_ends = 0
-    for row in range(height):
+    run = ZERO
+    above = ZERO  # the first run in the row above that may touch
+    above_ends = ZERO
+    for row in range(top, bottom):
         row_starts = run
-        column = 0
-        while column < width:
+        column = left
+        while column < right:
             if mask[row, column] != value:
                 column += 1
                 continue
             first = column
-            while column < width and mask[row, column] == value:
+            while column < right and mask[row, column] == value:
                 column += 1
             runs[run, 0] = row
             runs[run, 1] = first
             runs[run, 2] = column
             area[run] = column - first
-            if value == 0 and (row in (0, height - 1) or first == 0 or column == width):
+            at_side = first == left or column == right
+            if value == 0 and (at_side or row == top or row == bottom - 1):
                 area[run] = least_px  # reaches the border: not small
             while above < above_ends and runs[above, 2] + reach <= first:
                 above += 1
@@ -509,7 +514,8 @@ def _flip_small(mask: NDArray[np.uint8], value: int, least_px: int) -> None:
         above_ends = run
     for run in range(n_runs):
         if area[_root(parent, run)] < least_px:
-            mask[runs[run, 0], runs[run, 1] : runs[run, 2]] = 1 - value
+            for column in range(runs[run, 1], runs[run, 2]):
+                mask[runs[run, 0], column] = 1 - value
 
 
 @compiled

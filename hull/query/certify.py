@@ -304,10 +304,10 @@ def _certify_triangle(
                 n_cells, corners, matrices[camera], width, height, pads[camera], rectangle
             )
             vote = rectangle_vote(
-                rectangle[0, 0],
-                rectangle[1, 0],
-                rectangle[2, 0],
-                rectangle[3, 0],
+                np.int64(rectangle[0, 0]),
+                np.int64(rectangle[1, 0]),
+                np.int64(rectangle[2, 0]),
+                np.int64(rectangle[3, 0]),
                 width,
                 height,
                 integral_offset[camera],
@@ -382,7 +382,10 @@ def _certify(
         n_triangles += left.stop[k] - left.start[k]
     triangle, verdict = np.zeros(n_triangles, np.int64), np.zeros(n_triangles, np.int8)
     witness, edge_m = np.zeros((n_triangles, 3)), np.zeros(n_triangles)
-    corners, cell_pads = np.zeros((9, 1)), _ROUNDOFF_OF_CELLS * surface.pads
+    corners, cell_pads = np.zeros((9, 1)), np.zeros((n_cameras, 3))
+    for camera in range(n_cameras):
+        for k in range(3):
+            cell_pads[camera, k] = _ROUNDOFF_OF_CELLS * surface.pads[camera, k]
     room = 256
     cells, cuts = np.zeros((room, 9)), np.zeros(room, np.int64)
     accepted, is_open = np.zeros(room, np.int64), np.zeros((room, n_cameras), np.bool_)

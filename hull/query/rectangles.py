@@ -91,12 +91,12 @@ class Tree(NamedTuple):
     level_start: NDArray[np.int64]
 
 
-@compiled
+@compiled  # for 64-bit pixels only: callers convert, lest it be compiled twice
 def rectangle_vote(
-    first_x: int,
-    last_x: int,
-    first_y: int,
-    last_y: int,
+    first_x: int | np.int64,
+    last_x: int | np.int64,
+    first_y: int | np.int64,
+    last_y: int | np.int64,
     width: int,
     height: int,
     first: int,
@@ -283,10 +283,10 @@ def _node_verdict(
         camera = cameras[number]
         place = order[camera]
         vote = rectangle_vote(
-            rectangles[place, 0],
-            rectangles[place, 1],
-            rectangles[place, 2],
-            rectangles[place, 3],
+            np.int64(rectangles[place, 0]),
+            np.int64(rectangles[place, 1]),
+            np.int64(rectangles[place, 2]),
+            np.int64(rectangles[place, 3]),
             sizes[camera, 0],
             sizes[camera, 1],
             integral_offset[camera],
@@ -307,9 +307,13 @@ def _node_verdict(
 def open_nodes(level: int, tree: Tree, frame: Frame) -> NDArray[np.int64]:
     """Return the nodes of a level that are not proved free, counted within it, ascending."""
     n_cameras = len(frame.matrices)
-    cameras, left = np.arange(n_cameras), np.zeros(n_cameras, np.int64)
+    cameras, left = np.zeros(n_cameras, np.int64), np.zeros(n_cameras, np.int64)
+    for camera in range(n_cameras):
+        cameras[camera] = camera
     top = len(tree.level_start) - 2
-    nodes = np.arange(tree.level_start[top], tree.level_start[top + 1])
+    nodes = np.zeros(tree.level_start[top + 1] - tree.level_start[top], np.int64)
+    for number in range(len(nodes)):
+        nodes[number] = tree.level_start[top] + number
     for height in range(top, level - 1, -1):
         n_kept = 0
         for number in range(len(nodes)):
@@ -392,10 +396,10 @@ def _batch_verdicts(
         n_later = n_cameras - number - 1
         for i in range(n_left):
             vote = rectangle_vote(
-                rectangles[0, i],
-                rectangles[1, i],
-                rectangles[2, i],
-                rectangles[3, i],
+                np.int64(rectangles[0, i]),
+                np.int64(rectangles[1, i]),
+                np.int64(rectangles[2, i]),
+                np.int64(rectangles[3, i]),
                 width,
                 height,
                 first,
@@ -453,7 +457,7 @@ def survivors(
         np.zeros(capacity, np.int64),
         np.zeros((capacity, n_cameras), np.bool_),
     )
-    n = 0
+    n = ZERO
     for number in range(len(nodes)):
         stack[0, 0], stack[0, 1] = nodes[number], level
         depth = 1
