@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 #: Shares of the work for each thread: the last one to finish should not be waited for long.
-_SHARES = 8
+_SHARES = 4
 
 
 class Threads:
