@@ -82,7 +82,6 @@ def detect(
         make_chain,
         resolved_settings,
     )
-    from hybridve.hull.prepare import Prepared, start_preparing
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.machine import machine_text, software_versions
     from hybridve.hull.report.read import read_report
@@ -92,9 +91,6 @@ def detect(
     # Cameras run side by side in threads of their own; threads inside each would fight them.
     cv2.setNumThreads(1)
     refuse_existing(output, overwrite=overwrite)
-    preparation = start_preparing()
-    if preparation and progress:
-        click.echo("compiling the query for this machine, once: about 10 s", err=True)
     settings = EvaluateSettings(
         frames=frames,
         viewport=None if accuracy_mm is not None else viewport or 10,
@@ -117,7 +113,7 @@ def detect(
             total = count_frames(chain)
             results = evaluate(
                 chain,
-                Prepared(query, preparation) if preparation else query,
+                query,
                 skip=writer.n_done,
                 write_s=writer.take_write_s,
                 progress=StageProgress(enabled=progress),

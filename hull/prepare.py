@@ -1,20 +1,18 @@
-"""Compiles all that ``detect`` needs, before it is needed.
+"""Compiles all that ``detect`` needs, before it is needed: at set-up, or by ``doctor --prepare``.
 
 Half of the code is compiled by one process and half by another, side by side, because numba
 compiles in one thread at a time. They run it on the tiniest input and keep what they compiled
 where every later start looks (see `hybridve.hull.jit`). Both use `rectangles.survivors`; the
-second comes to it late, when the first has usually kept it.
+second comes to it late, when the first may have kept it. A ``detect`` that finds nothing compiled
+does it by itself: it needs only a part, 9 s of processor time where the two processes take 15.
 
 ``python -m hybridve.hull.prepare query`` compiles one half in this process.
 """
 
-import atexit
 import gc
 import subprocess
 import sys
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +20,7 @@ from numpy.typing import NDArray
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.jit import FOLDER
-from hybridve.hull.query.engine import Engine, Hits, Triangles
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
-from hybridve.hull.query.threads import usable_cpus
+from hybridve.hull.query.silhouettes import Views, make_hull, make_views
 
 #: Side in pixels of the images that are compiled with.
 _SIDE_PX = 64
@@ -38,81 +34,20 @@ def is_prepared() -> bool:
     return FOLDER is not None and all(_sign(FOLDER, part).exists() for part in _PARTS)
 
 
-class Preparation:
-    """Compiling that goes on in other processes; it ends with this one at the latest."""
-
-    def __init__(self) -> None:
-        self._processes = [
+def prepare_kernels() -> bool:
+    """Compile all that ``detect`` needs and keep it; tell whether it is kept."""
+    if FOLDER is not None and not is_prepared():
+        processes = [
             subprocess.Popen(
                 [sys.executable, "-m", "hybridve.hull.prepare", part],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
             )
             for part in _PARTS
         ]
-        atexit.register(self._stop)
-
-    def wait(self) -> None:
-        """Wait until all is compiled."""
-        for process in self._processes:
+        for process in processes:
             process.wait()
-
-    def _stop(self) -> None:
-        for process in self._processes:
-            process.terminate()
-        self.wait()
-
-
-def prepare_kernels() -> bool:
-    """Compile all that ``detect`` needs and keep it; tell whether it is kept."""
-    if FOLDER is not None and not is_prepared():
-        Preparation().wait()
     return is_prepared()
-
-
-def start_preparing() -> Preparation | None:
-    """Begin to compile, or return None where that is done, would not be kept or not help."""
-    if FOLDER is None or is_prepared() or usable_cpus() == 1:
-        return None
-    return Preparation()
-
-
-class Prepared:
-    """An engine whose first query waits for a preparation.
-
-    Parameters
-    ----------
-    engine : Engine
-        What answers.
-    preparation : Preparation
-        What to wait for: compiling the same in this process would take longer.
-    """
-
-    def __init__(self, engine: Engine, preparation: Preparation) -> None:
-        self._engine = engine
-        self._preparation = preparation
-        self.name, self.renderer = engine.name, engine.renderer
-
-    def query(self, hull: Hull, meshes: list[Triangles]) -> list[Hits]:
-        """Return for each mesh its samples inside the hull of this frame."""
-        self._preparation.wait()
-        return self._engine.query(hull, meshes)
-
-    def close(self) -> None:
-        """Close the engine."""
-        self._engine.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def _sign(folder: Path, part: str) -> Path:

@@ -156,45 +156,22 @@ def test_after_preparing_detect_compiles_nothing(tmp_path: Path) -> None:
 
     assert shown.stdout.split() == ["True", "True"], shown.stderr
     assert detected.returncode == 0, detected.stderr
-    assert "compiling" not in detected.stderr
     assert kept_code(tmp_path / "cache" / "compiled") == before
     # Two processes that compile one function for different types would take each other's code.
     assert all(name.endswith(".1.nbc") for name in before)
     assert {name.split(".")[0] for name in before} >= {"native", "certify", "segment", "background"}
 
 
-def test_an_engine_waits_for_what_is_compiled_before_its_first_query() -> None:
-    told = []
-
-    class Preparation:
-        def wait(self) -> None:
-            told.append("wait")
-
-    class Engine:
-        name, renderer = "an engine", "its renderer"
-
-        def query(self, *asked: object) -> object:
-            told.append("query")
-            return asked
-
-    engine = prepare.Prepared(Engine(), Preparation())
-
-    assert engine.query("hull", []) == ("hull", [])
-    assert told == ["wait", "query"]
-    assert (engine.name, engine.renderer) == ("an engine", "its renderer")
-
-
-def test_nothing_is_begun_that_is_done_or_would_not_be_kept(
+def test_nothing_is_compiled_that_is_done_or_would_not_be_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(prepare.subprocess, "Popen", None)  # calling it raises TypeError
     monkeypatch.setattr(prepare, "FOLDER", None)
-    assert prepare.start_preparing() is None
     assert not prepare.prepare_kernels()
 
     monkeypatch.setattr(prepare, "FOLDER", tmp_path)
     (tmp_path / "query.done").touch()
-    assert not prepare.is_prepared()
+    with pytest.raises(TypeError):
+        prepare.prepare_kernels()
     (tmp_path / "rest.done").touch()
-    assert prepare.is_prepared()
-    assert prepare.start_preparing() is None
     assert prepare.prepare_kernels()
