@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hybridve.calib.errors import SceneError, SessionError
-from hybridve.calib.lens import Undistortion, undistortion
+from hybridve.calib.lens import Undistortion, trimmed, undistortion
 from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import rig_to_dict
@@ -105,6 +105,8 @@ def rig_views(session: Session, rig: Rig) -> tuple[Views, list[Undistortion]]:
     """Return the session's cameras as pinhole views, and how their images become so."""
     cameras = [rig[camera.name] for camera in session.cameras]
     lenses = [undistortion(camera) for camera in cameras]
+    if session.unseen == "keep":  # gaps are background, but nobody saw them: no image, no gaps
+        lenses = [trimmed(lens) for lens in lenses]
     views = make_views(
         tuple(camera.name for camera in cameras),
         np.array([(lens.width_px, lens.height_px) for lens in lenses], np.int64),

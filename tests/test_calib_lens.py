@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from hybridve.calib import lens
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.lens import cam_from_img, img_from_cam, project_points, undistortion
+from hybridve.calib.lens import cam_from_img, img_from_cam, project_points, trimmed, undistortion
 from hybridve.calib.pose import (
     angle_between,
     compose,
@@ -22,6 +24,9 @@ from hybridve.calib.pose import (
     transform,
 )
 from hybridve.calib.rig import Rig
+from hybridve.hull.evaluate import rig_views
+from hybridve.hull.query.reference import contains_points
+from hybridve.hull.query.silhouettes import make_hull
 
 #: A pixel led to a ray and back, in pixels; COLMAP iterates to 1e-10 of a ray.
 ROUND_TRIP_PX = 1e-5
@@ -231,3 +236,67 @@ def test_a_rig_has_cameras_with_names_of_their_own() -> None:
         Rig((camera, camera))
     with pytest.raises(CalibrationError, match="no camera 'other'; it has cam"):
         Rig((camera,))["other"]
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_a_trimmed_image_has_no_gaps_and_cannot_grow(model: str) -> None:
+    whole = undistortion(make_camera("cam", model, POSE))
+
+    part = trimmed(whole)
+
+    if whole.map_x is None or part.map_x is None or part.map_y is None:
+        assert part is whole
+        return
+    has_gap = whole.map_x == -1
+    assert (part.map_x != -1).all()
+    assert (part.map_y != -1).all()
+    # The same rays in the same pixels, shifted by whole ones.
+    shift = whole.img_from_cam[:2, 2] - part.img_from_cam[:2, 2]
+    left, top = np.round(shift).astype(int)
+    np.testing.assert_allclose(shift, (left, top), rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(part.img_from_cam[:, :2], whole.img_from_cam[:, :2])
+    bottom, right = top + part.height_px, left + part.width_px
+    np.testing.assert_array_equal(part.map_x, whole.map_x[top:bottom, left:right])
+    # A row or column more on any side would have a gap, or is not there.
+    padded = np.pad(has_gap, 1, constant_values=True)
+    for more in (
+        padded[top, left + 1 : right + 1],
+        padded[bottom + 1, left + 1 : right + 1],
+        padded[top + 1 : bottom + 1, left],
+        padded[top + 1 : bottom + 1, right + 1],
+    ):
+        assert more.any()
+    # It holds the middle of the lens and most of what the camera sees.
+    assert part.map_x.size > 0.5 * (~has_gap).sum()
+
+
+def test_a_camera_that_abstains_does_not_carve_where_its_lens_shows_nothing() -> None:
+    """In the corners of a pinhole image the recorded one has nothing: nobody knows what is there.
+
+    A point there, seen by another camera on an object pixel, is in the hull.
+    """
+    camera = make_camera("bent", "OPENCV", POSE)
+    plain = make_camera("plain", "PINHOLE", look_at((-1.0, 1.5, 1.2), (0.0, 0.0, 0.1), 0.0))
+    session: Any = SimpleNamespace(
+        cameras=[SimpleNamespace(name="bent"), SimpleNamespace(name="plain")],
+        unseen="keep",
+        min_cameras=1,
+    )
+    views, lenses = rig_views(session, Rig((camera, plain)))
+    whole = undistortion(camera)
+    assert whole.map_x is not None
+    rows, columns = np.nonzero(whole.map_x == -1)
+    rays = np.linalg.solve(
+        whole.img_from_cam, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    ).T
+    points_world = transform(invert(camera.cam_from_world), 1.5 * rays)
+    masks = [np.ones((lens.height_px, lens.width_px), np.uint8) for lens in lenses]
+    pixels, depth_m = project_points(plain, points_world)
+    seen = (
+        (depth_m > 0) & (pixels > 1).all(axis=1) & (pixels < (WIDTH_PX - 1, HEIGHT_PX - 1)).all(1)
+    )
+    assert seen.sum() > 10
+
+    inside = contains_points(make_hull(views, masks), points_world[seen])
+
+    assert inside.all()
