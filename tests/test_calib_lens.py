@@ -24,6 +24,7 @@ from hybridve.calib.pose import (
     transform,
 )
 from hybridve.calib.rig import Rig
+from hybridve.hull.capture.recording import undistort_mask
 from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import make_hull
@@ -290,7 +291,8 @@ def test_a_camera_that_abstains_does_not_carve_where_its_lens_shows_nothing() ->
         whole.img_from_cam, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
     ).T
     points_world = transform(invert(camera.cam_from_world), 1.5 * rays)
-    masks = [np.ones((lens.height_px, lens.width_px), np.uint8) for lens in lenses]
+    recorded = np.full((HEIGHT_PX, WIDTH_PX), 255, np.uint8)  # object wherever a camera looks
+    masks = [undistort_mask(recorded, lens) for lens in lenses]
     pixels, depth_m = project_points(plain, points_world)
     seen = (
         (depth_m > 0) & (pixels > 1).all(axis=1) & (pixels < (WIDTH_PX - 1, HEIGHT_PX - 1)).all(1)
