@@ -173,7 +173,7 @@ class ReportWriter:
         file.attrs["versions"] = json.dumps(header.versions)
         for name, value, description in (
             ("configuration", header.settings, "the resolved configuration, JSON"),
-            ("rig", header.rig, "the rig as in rig.json, JSON"),
+            ("rig", header.rig, "the rig as in rig.json, each camera with mask_shift_px, JSON"),
         ):
             text = file.create_dataset(f"hybridve/settings/{name}", data=json.dumps(value))
             text.attrs["unit"] = "1"
