@@ -1,25 +1,23 @@
 """Compiles all that ``detect`` needs, before it is needed: at set-up, or by ``doctor --prepare``.
 
-Half of the code is compiled by one process and half by another, side by side, because numba
-compiles in one thread at a time. They run it on the tiniest input and keep what they compiled
-where every later start looks (see `hybridve.hull.jit`). Both use `rectangles.survivors`; the
-second comes to it late, when the first may have kept it. A ``detect`` that finds nothing compiled
-does it by itself: it needs only a part, 9 s of processor time where the two processes take 15.
-
-``python -m hybridve.hull.prepare query`` compiles one half in this process.
+The code is run on the tiniest input, and what was compiled is kept where every later start looks
+(see `hybridve.hull.jit`). numba compiles in one thread at a time. Two processes side by side were
+tried: 8 s instead of 11, for a third more work, as query and certificate share half of theirs.
 """
 
 import gc
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.capture.background import learn_background
+from hybridve.hull.capture.segment import Segmenter, SegmentSettings
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.jit import FOLDER
+from hybridve.hull.query.certify import Certifier
+from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Views, make_hull, make_views
 
 #: Side in pixels of the images that are compiled with.
@@ -28,31 +26,42 @@ _SIDE_PX = 64
 #: Quads along an edge of the sheet that is compiled with: enough triangles for clusters.
 _QUADS = 48
 
+#: The file that says that all is compiled.
+_SIGN = "complete"
+
 
 def is_prepared() -> bool:
     """Tell whether all is compiled and kept."""
-    return FOLDER is not None and all(_sign(FOLDER, part).exists() for part in _PARTS)
+    return FOLDER is not None and (FOLDER / _SIGN).exists()
 
 
 def prepare_kernels() -> bool:
     """Compile all that ``detect`` needs and keep it; tell whether it is kept."""
     if FOLDER is not None and not is_prepared():
-        processes = [
-            subprocess.Popen(
-                [sys.executable, "-m", "hybridve.hull.prepare", part],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-            )
-            for part in _PARTS
-        ]
-        for process in processes:
-            process.wait()
+        # The compiler leaves little that only a collection would free: a tenth of the time.
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            _run_kernels()
+        finally:
+            if collects:
+                gc.enable()
+        (FOLDER / _SIGN).touch()
     return is_prepared()
 
 
-def _sign(folder: Path, part: str) -> Path:
-    """Return the file that says that a part is compiled."""
-    return folder / f"{part}.done"
+def _run_kernels() -> None:
+    """Run everything that is compiled, on little."""
+    empty = np.full((_SIDE_PX, _SIDE_PX, 3), 100, np.uint8)
+    Segmenter(learn_background([empty]), SegmentSettings()).segment(
+        np.where(_mask()[..., None] == 1, np.uint8(200), empty)
+    )
+    views, sheet = _views(), _sheet()
+    with Native(1) as engine, Certifier(0.1, 1) as certifier:
+        for _ in range(2):  # clusters are made for the second frame
+            hull = make_hull(views, [_mask()])
+            detect_contacts(hull, [sheet], engine)
+            certifier.certify_mesh(hull, sheet.triangles)
 
 
 def _views() -> Views:
@@ -79,35 +88,3 @@ def _sheet() -> Body:
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     sheet = SceneObject("sheet", Path(), vertices, faces.astype(np.int32), 0.0, np.zeros(3), None)
     return make_body(sheet, viewport=10)
-
-
-def _compile_query() -> None:
-    from hybridve.hull.query.native import Native
-
-    views, sheet = _views(), _sheet()
-    with Native(1) as engine:
-        for _ in range(2):  # clusters are made for the second frame
-            detect_contacts(make_hull(views, [_mask()]), [sheet], engine)
-
-
-def _compile_rest() -> None:
-    from hybridve.hull.capture.background import learn_background
-    from hybridve.hull.capture.segment import Segmenter, SegmentSettings
-    from hybridve.hull.query.certify import Certifier
-
-    empty = np.full((_SIDE_PX, _SIDE_PX, 3), 100, np.uint8)
-    Segmenter(learn_background([empty]), SegmentSettings()).segment(
-        np.where(_mask()[..., None] == 1, np.uint8(200), empty)
-    )
-    with Certifier(0.1, 1) as certifier:
-        certifier.certify_mesh(make_hull(_views(), [_mask()]), _sheet().triangles)
-
-
-_PARTS = {"query": _compile_query, "rest": _compile_rest}
-
-
-if __name__ == "__main__":
-    gc.disable()  # a tenth of the time, in a process that ends at once
-    _PARTS[sys.argv[1]]()
-    if FOLDER is not None:
-        _sign(FOLDER, sys.argv[1]).touch()

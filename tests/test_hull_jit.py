@@ -1,5 +1,6 @@
 """Compiled code is kept where it belongs, and never taken for that of other sources."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -165,13 +166,16 @@ def test_after_preparing_detect_compiles_nothing(tmp_path: Path) -> None:
 def test_nothing_is_compiled_that_is_done_or_would_not_be_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(prepare.subprocess, "Popen", None)  # calling it raises TypeError
+    runs = []
+    monkeypatch.setattr(prepare, "_run_kernels", lambda: runs.append(gc.isenabled()))
     monkeypatch.setattr(prepare, "FOLDER", None)
     assert not prepare.prepare_kernels()
+    assert runs == []
 
     monkeypatch.setattr(prepare, "FOLDER", tmp_path)
-    (tmp_path / "query.done").touch()
-    with pytest.raises(TypeError):
-        prepare.prepare_kernels()
-    (tmp_path / "rest.done").touch()
+    assert not prepare.is_prepared()
     assert prepare.prepare_kernels()
+    assert prepare.prepare_kernels()
+
+    assert runs == [False]
+    assert gc.isenabled()
