@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from helpers.hulls import ball_hull, look_at, projection, ring_views, sphere_mesh
 
-from hybridve.hull.contact.detect import certify_contacts, detect_contacts, make_body
+from hybridve.hull.contact.detect import Body, certify_contacts, detect_contacts, make_body
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.certify import Certifier
+from hybridve.hull.query.engine import Hits, Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference, contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull, make_views
@@ -78,13 +79,15 @@ def test_a_collision_point_serves_as_witness() -> None:
     assert contains_points(hull, contact.witness_world[None])[0]
 
 
+def near_but_apart() -> tuple[Hull, Body]:
+    """A slanted plate whose box reaches into the hull's rectangles, but not the plate itself."""
+    hull = ball_hull(ring_views(6), np.array([0.0, 0.0, 0.15]), 0.1)
+    slanted = plate().vertices_world @ np.array([[1, 0, 0], [0, 0.8, 0.6], [0, -0.6, 0.8]]).T
+    return hull, make_body(part(slanted - [0.0, 0.0, 0.2], plate().faces), viewport=4)
+
+
 def test_what_is_near_but_apart_is_proved_free() -> None:
-    """The plate's box reaches into the hull's rectangles, the plate does not into the hull."""
-    views = ring_views(6)
-    hull = ball_hull(views, np.array([0.0, 0.0, 0.15]), 0.1)
-    rotated = plate().vertices_world @ np.array([[1, 0, 0], [0, 0.8, 0.6], [0, -0.6, 0.8]]).T
-    apart = part(rotated - np.array([0, 0, 0.2]), plate().faces)
-    body = make_body(apart, viewport=4)
+    hull, body = near_but_apart()
 
     with Reference() as engine, Certifier(1e-4) as certifier:
         sampled = detect_contacts(hull, [body], engine)
@@ -120,4 +123,23 @@ def test_what_cannot_be_decided_is_open_below_the_size_asked_for(open_at_m: floa
 
     assert contact.certificate == "open"
     assert 0 < contact.open_at_m <= open_at_m
+    assert not contact.collides
+
+
+def test_points_of_an_object_that_is_proved_free_are_taken_back() -> None:
+    """An engine in single precision may round a sample across a rim; a proof outweighs it."""
+    hull, body = near_but_apart()
+
+    class Rounding(Reference):
+        def query(self, hull: Hull, meshes: list[Triangles]) -> list[Hits]:
+            first = np.zeros(1, np.uint32)
+            return [Hits.from_samples(mesh.topology, first, first) for mesh in meshes]
+
+    with Certifier(1e-4) as certifier:
+        sampled = detect_contacts(hull, [body], Rounding())
+        (contact,) = certify_contacts(hull, [body], sampled, certifier)
+
+    assert sampled[0].collides
+    assert sampled[0].certificate == ""  # no sample stands up to double precision
+    assert contact.certificate == "free"
     assert not contact.collides
