@@ -1,6 +1,6 @@
 """The volume query, side by side: engines, plain NumPy, and what a user would pick instead.
 
-4 cameras of 720 x 486, viewport 10, a ball on the rim of a sphere of triangles, 1 to 2.4 % of which
+4 cameras of 720 x 486, viewport 10, a ball on the rim of a sphere of triangles, about 2 % of which
 collide. ``bench_frame`` goes from masks to hits, integral images included; ``bench_query`` from the
 hull to hits; ``bench_moving`` the same with new vertices in every frame. ``bench_voxels_and_fcl``
 is carving with Open3D, a surface by marching cubes, and python-fcl. ``bench_curtain`` is the
@@ -24,7 +24,7 @@ from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 from hybridve.hull.query.stencil import Stencil
 
-BALL_CENTER, BALL_RADIUS_M, SPHERE_RADIUS_M = np.array([0.5, 0.0, 0.0]), 0.13, 0.5
+BALL_CENTER, BALL_RADIUS_M, SPHERE_RADIUS_M = np.array([0.5, 0.0, 0.0]), 0.17, 0.5
 
 #: The largest mesh for which an engine is timed: beyond, it takes seconds a frame.
 LARGEST = {"native": 4_000_000, "compute": 4_000_000, "stencil": 200_000, "reference": 20_000}
@@ -68,7 +68,7 @@ def tell(benchmark: Any, mesh: Triangles, engine: Engine, hull: Hull) -> None:
     (hits,) = engine.query(hull, [mesh])
     triangle, _ = hits.samples()
     colliding = len(np.unique(triangle)) / len(mesh)
-    assert 0.009 < colliding < 0.03
+    assert 0.015 < colliding < 0.035
     benchmark.extra_info.update(
         triangles=len(mesh),
         colliding=colliding,
