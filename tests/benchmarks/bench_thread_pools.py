@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.query.choose import open_engine
 from hybridve.hull.query.silhouettes import make_hull
+from hybridve.hull.query.threads import usable_cpus
 
 Work = Callable[[], object]
 
@@ -102,20 +103,21 @@ def _prange() -> Work:
 
 @pytest.fixture
 def make_work() -> Iterator[Callable[[str], Work]]:
-    n_threads = cv2.getNumThreads()
+    before = cv2.getNumThreads()
     with ExitStack() as closing:
         makers: dict[str, Callable[[], Work]] = {
             "nothing": lambda: lambda: None,
             "native": lambda: _native(closing),
-            "opencv": lambda: _opencv(n_threads),
+            "opencv": lambda: _opencv(usable_cpus()),
             "opencv_1": lambda: _opencv(1),
             "open3d": _open3d,
             "prange": _prange,
         }
         yield lambda name: makers[name]()
-    cv2.setNumThreads(n_threads)
+    cv2.setNumThreads(before)
 
 
+@pytest.mark.filterwarnings("ignore:The TBB threading layer")
 @pytest.mark.parametrize(("timed", "beside"), _TURNS)
 def bench_in_turn(
     benchmark: Any, make_work: Callable[[str], Work], timed: str, beside: str
