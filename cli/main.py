@@ -62,6 +62,23 @@ for command in (cli, *cli.commands.values()):
     command.help = (command.help or "").replace("\\b", "\b")
 
 
+def _leave_interrupted() -> NoReturn:
+    click.echo("interrupted", err=True)
+    sys.exit(_INTERRUPTED)
+
+
+def _is_interruption(error: BaseException | None) -> bool:
+    """Tell whether an error comes from Ctrl-C.
+
+    Pressed while compiled code hands its result to Python, it arrives wrapped in SystemErrors.
+    """
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def main() -> NoReturn:
     """Run the command line and leave with its exit status."""
     try:
@@ -73,8 +90,11 @@ def main() -> NoReturn:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
     except (KeyboardInterrupt, click.Abort):
-        click.echo("interrupted", err=True)
-        sys.exit(_INTERRUPTED)
+        _leave_interrupted()
+    except SystemError as error:
+        if not _is_interruption(error):
+            raise
+        _leave_interrupted()
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     sys.exit(0)

@@ -73,9 +73,17 @@ def test_help_loads_no_heavy_library() -> None:
     assert "detect" in shown.stdout
 
 
+def caused_by(cause: BaseException) -> SystemError:
+    """Return an error as compiled code passes it on: wrapped, and wrapped again."""
+    inner, outer = SystemError("returned a result with an exception set"), SystemError("the same")
+    inner.__cause__, outer.__cause__ = cause, inner
+    return outer
+
+
 @pytest.mark.parametrize(
     ("error", "status", "text"),
     [
+        (caused_by(KeyboardInterrupt()), 130, "interrupted"),
         (HybridveError("rig.json: camera 'left': broken"), 1, "error: rig.json: camera 'left'"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (click.UsageError("give one of both"), 2, "give one of both"),
@@ -100,6 +108,18 @@ def test_errors_become_one_line_and_a_status(
     assert text in shown.err
     assert shown.out == ""
     assert "Traceback" not in shown.err
+
+
+def test_a_system_error_of_another_cause_is_not_taken_for_an_interruption(
+    run: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise caused_by(MemoryError())
+
+    monkeypatch.setattr(cli.commands["doctor"], "callback", fail)
+
+    with pytest.raises(SystemError, match="the same"):
+        run("doctor")
 
 
 def test_a_reader_that_has_seen_enough_hears_no_complaint() -> None:
