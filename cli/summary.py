@@ -63,7 +63,8 @@ def print_summary(report: "Report") -> None:
     for found in numbers["objects"]:
         if missed := found["frames_colliding"] - found["frames_sampled_colliding"]:
             click.echo(
-                f"  {found['name']}: in {missed} frames no sample collides, but a certified point; "
+                f"  {found['name']}: in {missed} frame{'s' if missed > 1 else ''} no sample collides, "
+                "but a certified point does; "
                 "--viewport or --accuracy-mm finds more points"
             )
     if numbers["sample_spacing_m"] is not None:

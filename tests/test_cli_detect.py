@@ -357,7 +357,9 @@ def test_what_the_samples_miss_is_certified_told_and_fails_on_clash(
     hit = read_report(path).objects["hit"]
     missed = (hit.certificate == "colliding") & ~hit.collides
     assert missed.any()
-    assert f"hit: in {missed.sum()} frames no sample collides, but a certified point" in told
+    count = missed.sum()
+    frames = "frame" if count == 1 else "frames"
+    assert f"hit: in {count} {frames} no sample collides, but a certified point does" in told
     # The witness is on the cube's surface, in a frame whose ball is there.
     np.testing.assert_allclose(np.abs(hit.witness_m[missed]).max(axis=1), HALF_M, atol=1e-9)
     distance_m = np.linalg.norm(hit.witness_m[missed] - CENTERS[missed], axis=1)
