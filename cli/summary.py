@@ -62,9 +62,9 @@ def print_summary(report: "Report") -> None:
         click.echo("  " + "  ".join(cells).rstrip())
     for found in numbers["objects"]:
         if missed := found["frames_colliding"] - found["frames_sampled_colliding"]:
+            frames = "1 frame" if missed == 1 else f"{missed} frames"
             click.echo(
-                f"  {found['name']}: in {missed} frame{'s' if missed > 1 else ''} no sample collides, "
-                "but a certified point does; "
+                f"  {found['name']}: in {frames} no sample collides, but a certified point does; "
                 "--viewport or --accuracy-mm finds more points"
             )
     if numbers["sample_spacing_m"] is not None:
