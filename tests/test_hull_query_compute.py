@@ -14,6 +14,7 @@ from helpers.hulls import (
     ball_hull,
     differences,
     is_in_order,
+    large_views,
     look_at,
     near_pixel_edge,
     projection,
@@ -57,17 +58,6 @@ def compute(context: moderngl.Context) -> Iterator[Compute]:
     with Compute(context) as engine:
         yield engine
     assert context.error == "GL_NO_ERROR"
-
-
-def large_views(rng: np.random.Generator) -> Views:
-    """Four cameras of 1600 x 1200, 2 to 10 m away, focal lengths from wide to long."""
-    matrices = []
-    for focal_px in (500.0, 1000.0, 2000.0, 3000.0):
-        direction = rng.normal(size=3)
-        center = direction / np.linalg.norm(direction) * rng.uniform(2.0, 10.0)
-        pose = look_at(center, np.zeros(3), rng.uniform(0, 6.0))
-        matrices.append(projection(pose, focal_px, 1600, 1200))
-    return make_views(tuple("abcd"), np.array([[1600, 1200]] * 4), np.array(matrices))
 
 
 def counters(engine: Compute) -> tuple[int, int]:
@@ -430,25 +420,6 @@ def test_meshes_with_viewports_of_every_size_are_sampled_alike(compute: Compute,
     assert sum(map(len, found)) > 100
 
 
-def test_meshes_are_told_apart(compute: Compute) -> None:
-    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
-    nothing = Triangles(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
-    far = sphere_mesh(100, center_world=(2.0, 0.0, 0.0))
-    meshes = [sphere_mesh(100, 0.1), nothing, far, sphere_mesh(500, 0.19, viewport=7), nothing]
-
-    found, expected = compute.query(hull, meshes), native.query(hull, meshes)
-
-    assert [len(hits) for hits in found] == [len(hits) for hits in expected]
-    assert [len(hits) > 0 for hits in found] == [True, False, False, True, False]
-    for mesh, hits, expected_hits in zip(meshes, found, expected, strict=True):
-        assert is_in_order(mesh, hits)
-        assert_same_samples(hits, expected_hits)
-
-
-def test_no_meshes_is_no_hits(compute: Compute) -> None:
-    assert compute.query(ball_hull(ring_views(), np.zeros(3), 0.2), []) == []
-
-
 def test_buffers_grow_when_a_frame_overflows_them(
     context: moderngl.Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -538,29 +509,6 @@ def test_what_belonged_to_a_mesh_leaves_the_device_with_it(compute: Compute) -> 
     assert list(compute._surfaces) == [kept.topology]
 
 
-def test_the_same_engine_serves_other_cameras(compute: Compute) -> None:
-    mesh = sphere_mesh(2000, 0.2, viewport=5)
-    for n_cameras in (2, 9, 4, 17, 255):
-        for center in ([0.2, 0.0, 0.0], [0.0, 0.1, 0.1]):
-            hull = ball_hull(ring_views(n_cameras, 80, 60, 80.0), np.array(center), 0.15)
-
-            (found,), (expected,) = compute.query(hull, [mesh]), native.query(hull, [mesh])
-
-            difference = differences(hull.views, mesh, found, expected, EDGE_BAND_PX)
-            assert difference.outside_band == []
-            assert len(expected) > 0
-
-
-def test_without_opengl_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_library(**settings: object) -> None:
-        raise Exception("libEGL.so not loaded")
-
-    monkeypatch.setattr(device_module.moderngl, "create_context", no_library)
-
-    with pytest.raises(DeviceError, match=r"libEGL.so not loaded.*libegl1.*libgl1-mesa-dri"):
-        Compute()
-
-
 def test_a_driver_that_does_not_compile_the_shaders_is_named(
     compute: Compute, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -569,21 +517,3 @@ def test_a_driver_that_does_not_compile_the_shaders_is_named(
 
     with pytest.raises(DeviceError, match=r"does not compile volume_cluster.*nothing.*native"):
         compute.programs_for(4)
-
-
-def test_engines_with_devices_of_their_own_take_turns() -> None:
-    hull = ball_hull(ring_views(), np.array([0.1, 0.0, 0.0]), 0.2)
-    meshes = [sphere_mesh(100 * k, 0.2, viewport=5) for k in range(1, 4)]
-    with Compute() as first, Compute() as second:
-        for mesh in meshes:
-            (of_first,), (of_second,) = first.query(hull, [mesh]), second.query(hull, [mesh])
-            assert_same_samples(of_first, of_second)
-            assert len(of_first) > 0
-
-
-def test_closing_twice_is_harmless(context: moderngl.Context) -> None:
-    engine = Compute(context)
-    engine.close()
-    engine.close()
-
-    assert context.error == "GL_NO_ERROR"

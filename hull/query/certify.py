@@ -34,15 +34,13 @@ The specification in NumPy is `hybridve.hull.query.certify_reference`.
 """
 
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.clusters import make_frame, make_shares
-from hybridve.hull.query.engine import Triangles
+from hybridve.hull.query.engine import Closing, Triangles
 from hybridve.hull.query.rectangles import (
     ACCEPTS,
     REJECTS,
@@ -118,7 +116,7 @@ class MeshCertificate:
     open_at_m: float
 
 
-class Certifier:
+class Certifier(Closing):
     """Certifies meshes, with threads that are kept from call to call.
 
     Parameters
@@ -192,17 +190,6 @@ class Certifier:
     def close(self) -> None:
         """End the threads; a later call starts them again."""
         self._threads.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def certify_triangles(hull: Hull, mesh: Triangles, open_at_m: float) -> Certificates:

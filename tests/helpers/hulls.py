@@ -159,6 +159,17 @@ def random_views(
     return make_views(names, np.array(sizes), matrices, unseen, min_cameras)
 
 
+def large_views(rng: np.random.Generator) -> Views:
+    """Return four cameras of 1600 x 1200, 2 to 10 m away, focal lengths from wide to long."""
+    matrices = []
+    for focal_px in (500.0, 1000.0, 2000.0, 3000.0):
+        direction = rng.normal(size=3)
+        center = direction / np.linalg.norm(direction) * rng.uniform(2.0, 10.0)
+        pose = look_at(center, np.zeros(3), rng.uniform(0, 6.0))
+        matrices.append(projection(pose, focal_px, 1600, 1200))
+    return make_views(tuple("abcd"), np.array([[1600, 1200]] * 4), np.array(matrices))
+
+
 #: Silhouettes that leave something of the hull, and those that leave (next to) nothing.
 MASK_KINDS = ("blobs", "holes", "noise", "half", "full")
 EMPTYING_MASK_KINDS = ("empty", "pixel")

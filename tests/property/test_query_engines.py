@@ -95,42 +95,23 @@ def ask(engine: Native | Compute | Stencil | Reference, hull: Hull, mesh: Triang
     return hits
 
 
-@examples
-@given(scene=scenes())
-def test_native_takes_the_samples_of_the_reference(
-    native: Native, scene: tuple[Hull, Triangles]
-) -> None:
-    hull, mesh = scene
-
-    found, expected = ask(native, hull, mesh), ask(Reference(), hull, mesh)
-
-    assert differences(hull.views, mesh, found, expected, DOUBLE_BAND_PX).outside_band == []
-
-
 @pytest.mark.gl
+@pytest.mark.parametrize(
+    ("name", "band_px"),
+    [("native", DOUBLE_BAND_PX), ("compute", EDGE_BAND_PX), ("stencil", EDGE_BAND_PX)],
+)
 @examples
 @given(scene=scenes())
-def test_compute_takes_the_samples_of_the_reference(
-    compute: Compute, scene: tuple[Hull, Triangles]
+def test_an_engine_takes_the_samples_of_the_reference(
+    request: pytest.FixtureRequest, name: str, band_px: float, scene: tuple[Hull, Triangles]
 ) -> None:
     hull, mesh = scene
 
-    found, expected = ask(compute, hull, mesh), ask(Reference(), hull, mesh)
+    found, expected = (
+        ask(engine, hull, mesh) for engine in (request.getfixturevalue(name), Reference())
+    )
 
-    assert differences(hull.views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
-
-
-@pytest.mark.gl
-@examples
-@given(scene=scenes())
-def test_stencil_takes_the_samples_of_the_reference(
-    stencil: Stencil, scene: tuple[Hull, Triangles]
-) -> None:
-    hull, mesh = scene
-
-    found, expected = ask(stencil, hull, mesh), ask(Reference(), hull, mesh)
-
-    assert differences(hull.views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+    assert differences(hull.views, mesh, found, expected, band_px).outside_band == []
 
 
 @examples
