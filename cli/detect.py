@@ -1,6 +1,7 @@
 """``hybridve detect``: collisions of a recording with CAD, frame by frame, into a report."""
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,14 +112,17 @@ def detect(
         )
         with ReportWriter(output, header, resume=resume, overwrite=overwrite) as writer:
             total = count_frames(chain)
-            results = evaluate(
+            evaluation = evaluate(
                 chain,
                 query,
                 skip=writer.n_done,
                 write_s=writer.take_write_s,
                 progress=StageProgress(enabled=progress),
             )
-            with progress_bar("detect", total, done=writer.n_done, enabled=progress) as advance:
+            with (
+                closing(evaluation) as results,
+                progress_bar("detect", total, done=writer.n_done, enabled=progress) as advance,
+            ):
                 for result in results:
                     writer.append(result)
                     advance()

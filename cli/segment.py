@@ -1,6 +1,7 @@
 """``hybridve segment``: silhouettes of a recording, stored beside the session."""
 
 import json
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -69,8 +70,9 @@ def segment(
     names = [camera.name for camera in loaded.cameras]
     object_pixels = [0] * len(names)
     n_frames, n_invalid = 0, 0
-    frames = segmented_frames(loaded, FrameRange(), progress=StageProgress(enabled=progress))
+    recording = segmented_frames(loaded, FrameRange(), progress=StageProgress(enabled=progress))
     with (
+        closing(recording) as frames,
         SilhouetteWriter(output, names, sizes_px, silhouette_stamp(loaded, digest)) as writer,
         progress_bar("segment", claimed_length(loaded), enabled=progress) as advance,
     ):

@@ -8,8 +8,8 @@
 """
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable, Generator
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -157,8 +157,8 @@ def evaluate(
     skip: int = 0,
     write_s: Callable[[], float] = lambda: 0.0,
     progress: Callable[[str, int, int], None] | None = None,
-) -> Iterator[FrameResult]:
-    """Yield the result of every frame.
+) -> Generator[FrameResult]:
+    """Yield the result of every frame; to be closed where it is left before its end.
 
     Parameters
     ----------
@@ -180,8 +180,11 @@ def evaluate(
     """
     n_yielded = 0
     open_at_m = chain.settings.open_at_m
-    with Certifier(open_at_m) if open_at_m else nullcontext() as certifier:
-        for silhouettes in _silhouettes(chain, skip, progress):
+    with (
+        Certifier(open_at_m) if open_at_m else nullcontext() as certifier,
+        closing(_silhouettes(chain, skip, progress)) as frames,
+    ):
+        for silhouettes in frames:
             started = time.perf_counter()
             contacts: list[Contact] = []
             if silhouettes.masks is not None:
@@ -280,7 +283,7 @@ def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
 
 def _silhouettes(
     chain: Chain, skip: int, progress: Callable[[str, int, int], None] | None
-) -> Iterator[FrameSilhouettes]:
+) -> Generator[FrameSilhouettes]:
     frames = chain.settings.frames
     start = frames.start + skip * frames.step
     if frames.stop is not None and start >= frames.stop:

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,8 @@ import numpy as np
 import pytest
 from helpers.sessions import BALL_RADIUS_M, write_ball_session, write_cube_scene
 
+from hybridve.hull.capture.recording import FrameRange, segmented_frames
+from hybridve.hull.capture.session import load_session
 from hybridve.hull.report.read import read_points, read_report
 
 Run = Callable[..., int]
@@ -367,3 +370,16 @@ def test_what_the_samples_miss_is_certified_told_and_fails_on_clash(
     sampled = read_report(plain).objects["hit"]
     np.testing.assert_array_equal(sampled.collides, hit.collides)
     assert (sampled.certificate[missed] == "").all()
+
+
+def test_whoever_leaves_a_recording_early_leaves_no_thread_behind(tmp_path: Path) -> None:
+    """A thread that is inside a library when Python ends would take the process down."""
+    session = load_session(write_ball_session(tmp_path / "session", np.tile(CENTERS, (10, 1))))
+    frames = segmented_frames(session, FrameRange())
+    next(frames)
+    lanes = [thread for thread in threading.enumerate() if thread.name.startswith("camera ")]
+    assert len(lanes) == 4
+
+    frames.close()
+
+    assert not any(lane.is_alive() for lane in lanes)

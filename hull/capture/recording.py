@@ -9,7 +9,7 @@ import json
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -169,7 +169,7 @@ def segmented_frames(
     *,
     undistortions: list[Undistortion] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
-) -> Iterator[FrameSilhouettes]:
+) -> Generator[FrameSilhouettes]:
     """Yield the silhouettes of a session's frames, cut out of its recordings.
 
     A frame that a camera lacks is yielded with the reason. The frames end where all cameras end.
@@ -201,7 +201,7 @@ def stored_frames(
     frames: FrameRange,
     *,
     undistortions: list[Undistortion] | None = None,
-) -> Iterator[FrameSilhouettes]:
+) -> Generator[FrameSilhouettes]:
     """Yield the silhouettes of a session's frames as they were stored by ``hybridve segment``."""
     stop = reader.n_frames if frames.stop is None else min(frames.stop, reader.n_frames)
     for index in range(frames.start, stop, frames.step):
@@ -343,7 +343,7 @@ class _Lane(threading.Thread):
         return self._out.get()
 
     def stop(self) -> None:
-        """End the thread, whatever it is at."""
+        """Have the thread end with the frame that it is at."""
         self._stopped.set()
         with suppress(queue.Empty):
             while True:
@@ -407,7 +407,7 @@ def _side_by_side(
     cutters: list[Callable[[Image], Mask]],
     frames: FrameRange,
     undistortions: list[Undistortion] | None,
-) -> Iterator[FrameSilhouettes]:
+) -> Generator[FrameSilhouettes]:
     lanes = [
         _Lane(camera, source, cutter, frames, undistortions[number] if undistortions else None)
         for number, (camera, source, cutter) in enumerate(
@@ -442,3 +442,6 @@ def _side_by_side(
     finally:
         for lane in lanes:
             lane.stop()
+        # A thread that is inside a library when Python ends takes the whole process down.
+        for lane in lanes:
+            lane.join()
