@@ -18,11 +18,13 @@ import pytest
 from helpers.hulls import ball_hull, look_at, projection, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
+from hybridve.hull.query import clusters, rectangles
 from hybridve.hull.query.choose import open_engine
 from hybridve.hull.query.engine import Engine, Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 from hybridve.hull.query.stencil import Stencil
+from hybridve.hull.query.threads import Threads
 
 BALL_CENTER, BALL_RADIUS_M, SPHERE_RADIUS_M = np.array([0.5, 0.0, 0.0]), 0.17, 0.5
 
@@ -160,6 +162,46 @@ def bench_floor(benchmark: Any, masks: Masks, what: str) -> None:
         mesh = sphere_mesh(1_000_000, SPHERE_RADIUS_M)
         benchmark.extra_info["bytes"] = mesh.vertices_world.nbytes + mesh.faces.nbytes
         benchmark(lambda: (mesh.vertices_world.max(), mesh.faces.max()))
+
+
+@pytest.mark.parametrize("n_triangles", [1_000_000, 4_000_000])
+def bench_work(
+    benchmark: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    views: Views,
+    masks: Masks,
+    n_triangles: int,
+) -> None:
+    """How many clusters and triangles a query asks, and samples: `extra_info`; the time is none.
+
+    The sources of the compiled loops run, so that they can be counted.
+    """
+    mesh, threads = sphere_mesh(n_triangles, SPHERE_RADIUS_M), Threads(1)
+    next_hull = frames(views, masks)
+    asked = {"clusters": 0, "triangles": 0}
+    for name, what, place in (
+        ("_node_verdict", "clusters", None),
+        ("_batch_verdicts", "triangles", 1),
+    ):
+        compiled = getattr(rectangles, name)
+
+        def count(
+            *given: Any, _of: Any = compiled, _as: str = what, _at: int | None = place
+        ) -> Any:
+            asked[_as] += 1 if _at is None else int(given[_at])
+            return _of(*given)
+
+        monkeypatch.setattr(rectangles, name, count)
+    monkeypatch.setattr(clusters, "open_nodes", rectangles.open_nodes.py_func)
+    for _ in range(2):  # clusters are made for the second frame
+        asked.update(clusters=0, triangles=0)
+        hull = next_hull()
+        frame = clusters.make_frame(hull)
+        shares = clusters.make_shares(hull, frame, mesh, threads)
+        left = [rectangles.survivors.py_func(*share, frame) for share in shares]
+    sampled = sum(int(part.is_open.any(axis=1).sum()) for part in left)
+    benchmark.extra_info.update(asked, sampled=sampled)
+    benchmark.pedantic(lambda: None, rounds=1)
 
 
 class VoxelsAndFcl:
