@@ -41,6 +41,7 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
+from hybridve.hull.contact.finding import Finding
 from hybridve.hull.contact.scene import Scene
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
@@ -197,7 +198,7 @@ def evaluate(
                 index=silhouettes.index,
                 time_s=silhouettes.index / chain.session.fps,
                 reason=silhouettes.reason,
-                contacts=tuple(contacts),
+                findings=tuple(Finding(contact) for contact in contacts),
                 stage_s={
                     "decode": silhouettes.decode_s,
                     "segment": silhouettes.segment_s,

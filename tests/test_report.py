@@ -13,6 +13,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from hybridve.calib.errors import ReportError
 from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.finding import Finding
 from hybridve.hull.report import write
 from hybridve.hull.report.read import read_points, read_report
 from hybridve.hull.report.schema import STAGES, FrameResult, ReportHeader
@@ -37,6 +38,10 @@ def a_header(n_objects: int, **changes: Any) -> ReportHeader:
     return ReportHeader(**(values | changes))
 
 
+def a_result(index: int, *contacts: Contact, reason: str = "") -> FrameResult:
+    return FrameResult(index, index / 25, reason, tuple(map(Finding, contacts)), {})
+
+
 @st.composite
 def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -58,7 +63,9 @@ def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
                 )
             )
         stage_s = dict(zip(STAGES, rng.uniform(size=len(STAGES)).tolist(), strict=True))
-        results.append(FrameResult(index, index / 25, reason, tuple(contacts), stage_s))
+        results.append(
+            FrameResult(index, index / 25, reason, tuple(map(Finding, contacts)), stage_s)
+        )
     return results
 
 
@@ -104,7 +111,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
                 assert np.isnan(rows.open_at_m[row])
                 assert len(xyz_m) == 0
                 continue
-            contact = result.contacts[number]
+            contact = result.findings[number].contact
             assert rows.collides[row] == contact.collides
             assert rows.n_triangles[row] == len(set(contact.triangle.tolist()))
             assert rows.certificate[row] == contact.certificate
@@ -157,7 +164,7 @@ def test_vtk_reads_the_points_of_every_frame(
         reader.UpdateTimeStep(result.time_s)  # as ParaView asks
 
         shown = reader.GetOutputDataObject(0)
-        contacts = result.contacts
+        contacts = [finding.contact for finding in result.findings]
         expected = [point for c in contacts for point in c.points_world.tolist()]
         triangles = [number for c in contacts for number in c.triangle.tolist()]
         objects = [i for i, c in enumerate(contacts) for _ in c.triangle]
@@ -170,7 +177,7 @@ def test_vtk_reads_the_points_of_every_frame(
 
 def one_result() -> list[FrameResult]:
     contact = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
-    return [FrameResult(0, 0.0, "", (contact, contact), dict.fromkeys(STAGES, 0.0))]
+    return [a_result(0, contact, contact)]
 
 
 def test_a_killed_run_leaves_finished_parts_that_can_be_taken_up(
@@ -316,9 +323,9 @@ def test_a_witness_counts_as_a_collision_and_open_is_not_free(tmp_path: Path) ->
     write_all(
         path,
         [
-            FrameResult(0, 0.0, "", (free, is_open[0]), {}),
-            FrameResult(1, 0.1, "", (missed, is_open[1]), {}),
-            FrameResult(2, 0.2, "", (free, free), {}),
+            a_result(0, free, is_open[0]),
+            a_result(1, missed, is_open[1]),
+            a_result(2, free, free),
         ],
     )
 
@@ -333,15 +340,14 @@ def test_a_witness_counts_as_a_collision_and_open_is_not_free(tmp_path: Path) ->
 
 def test_an_object_is_called_free_only_if_every_evaluated_frame_is_proved(tmp_path: Path) -> None:
     free, sampled = Contact("free", *NOTHING), Contact("", *NOTHING)
-    stage_s = dict.fromkeys(STAGES, 0.0)
     path = tmp_path / "report.h5"
 
     write_all(
         path,
         [
-            FrameResult(0, 0.0, "", (free, free), stage_s),
-            FrameResult(1, 0.1, "camera gone", (), stage_s),
-            FrameResult(2, 0.2, "", (free, sampled), stage_s),
+            a_result(0, free, free),
+            a_result(1, reason="camera gone"),
+            a_result(2, free, sampled),
         ],
     )
 

@@ -1,7 +1,7 @@
 """Reports as they are read back: known versions only, damage told in one line."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.hull.report.schema import FORMAT, STAGES, VERSION
+from hybridve.hull.report.schema import (
+    FORMAT,
+    FRAME_COLUMNS,
+    OFFSET,
+    TABLES,
+    VERSION,
+    Column,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,27 +28,62 @@ class ObjectColumns:
 
     Attributes
     ----------
-    collides : (F,) bool
-    n_points, n_triangles : (F,) uint32
-    certificate : (F,) str
-    witness_m : (F, 3) float64
-        A point of the surface in the hull, world frame; NaN unless certified to collide.
-    open_at_m : (F,) float64
-        No disc of this diameter on the surface is in the hull; NaN unless open.
+    columns : dict of arrays
+        By the names of `hybridve.hull.report.schema`, (F, ...) each; a column that is not there
+        was not computed.
     offset : (F + 1,) uint64
         The collision points of row f are ``offset[f]`` to ``offset[f + 1]``; see `read_points`.
     about : dict
         Attributes: the mesh, its number of triangles, the spacing of its samples.
     """
 
-    collides: NDArray[np.bool_]
-    n_points: NDArray[np.uint32]
-    n_triangles: NDArray[np.uint32]
-    certificate: NDArray[np.str_]
-    witness_m: NDArray[np.float64]
-    open_at_m: NDArray[np.float64]
+    columns: dict[str, NDArray[Any]]
     offset: NDArray[np.uint64]
     about: dict[str, Any]
+
+    def __contains__(self, name: str) -> bool:
+        """Tell whether a column was computed."""
+        return name in self.columns
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return a column; KeyError if it was not computed."""
+        return self.columns[name]
+
+    @property
+    def collides(self) -> NDArray[np.bool_]:
+        """Whether a sample is in the hull, (F,)."""
+        return self.columns["collides"]
+
+    @property
+    def n_points(self) -> NDArray[np.uint32]:
+        """The number of collision points, (F,)."""
+        return self.columns["n_points"]
+
+    @property
+    def n_triangles(self) -> NDArray[np.uint32]:
+        """The number of triangles with a collision point, (F,)."""
+        return self.columns["n_triangles"]
+
+    @property
+    def certificate(self) -> NDArray[np.str_]:
+        """How far each verdict can be trusted, (F,)."""
+        return self.columns["certificate"]
+
+    @property
+    def witness_m(self) -> NDArray[np.float64]:
+        """A point of the surface in the hull, world frame, (F, 3); NaN unless it is certified."""
+        return self.columns["witness_m"]
+
+    @property
+    def open_at_m(self) -> NDArray[np.float64]:
+        """No disc of this diameter on the surface is in the hull, (F,); NaN unless open."""
+        return self.columns["open_at_m"]
+
+    @property
+    def touches(self) -> NDArray[np.bool_]:
+        """Whether a point of the surface is in the hull, sampled or certified, (F,)."""
+        touches: NDArray[np.bool_] = self.collides | (self.certificate == "colliding")
+        return touches
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,30 +130,51 @@ def read_report(path: Path) -> Report:
         If there is no such file, it is not a report, of an unknown version, or damaged.
     """
     with _open(path) as file:
-        frames = file["hybridve/frames"]
+        frames = _columns(file["hybridve/frames"], FRAME_COLUMNS, may_be_absent=True)
         return Report(
             path=path,
             attributes={name: _plain(value) for name, value in file.attrs.items()},
             settings=json.loads(file["hybridve/settings/configuration"].asstr()[()]),
             rig=json.loads(file["hybridve/settings/rig"].asstr()[()]),
-            index=frames["index"][:],
-            time_s=frames["time_s"][:],
-            reason=frames["reason"].asstr()[:].astype(np.str_),
-            stage_s={name: frames[f"stage_s/{name}"][:] for name in STAGES},
+            index=frames["index"],
+            time_s=frames["time_s"],
+            reason=frames["reason"],
+            stage_s={
+                name.removeprefix(_STAGE): seconds
+                for name, seconds in frames.items()
+                if name.startswith(_STAGE)
+            },
             objects={
                 name: ObjectColumns(
-                    collides=group["collides"][:],
-                    n_points=group["n_points"][:],
-                    n_triangles=group["n_triangles"][:],
-                    certificate=group["certificate"].asstr()[:].astype(np.str_),
-                    witness_m=group["witness_m"][:],
-                    open_at_m=group["open_at_m"][:],
-                    offset=group["points/offset"][:],
+                    columns={
+                        key: values
+                        for table in TABLES
+                        for key, values in _columns(
+                            group, table.columns, may_be_absent=table.part != "contact"
+                        ).items()
+                    },
+                    offset=group[OFFSET.name][:],
                     about={key: _plain(value) for key, value in group.attrs.items()},
                 )
                 for name, group in file["hybridve/objects"].items()
             },
         )
+
+
+_STAGE = "stage_s/"
+
+
+def _columns(
+    group: h5py.Group, columns: Iterable[Column[Any]], *, may_be_absent: bool
+) -> dict[str, NDArray[Any]]:
+    """Return columns by name; raise KeyError if one is absent that may not be."""
+    return {
+        column.name: group[column.name].asstr()[:].astype(np.str_)
+        if column.dtype is str
+        else group[column.name][:]
+        for column in columns
+        if not may_be_absent or column.name in group
+    }
 
 
 def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

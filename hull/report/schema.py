@@ -1,19 +1,33 @@
-"""What a report holds: one row a frame, and the names under which it is found in the file.
+"""What a report holds: every column declared once, and how it is taken from a result.
 
 The layout is that of DESIGN, 4.4. A dataset that is not there was not computed; none holds invented
-values.
+values. Writing, taking up a run that was cut off, and reading all go by the tables of this module:
+a new number in a report is one more line in one of them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.finding import Finding
 
 FORMAT = "hybridve-report"
 VERSION = 1
 
 #: The stages whose seconds a report keeps, in the order in which a frame runs through them.
 STAGES = ("decode", "segment", "query", "certify", "write")
+
+#: How far a number can be trusted. "exact": what it says, to floating-point accuracy. "bound": the
+#: truth is on one side of it, or between two. "estimate": near the truth, by a model of errors or
+#: a guess at what was not seen. "sampled": of the samples alone; what lies between them is missed.
+Kind = Literal["exact", "bound", "estimate", "sampled"]
+
+#: What an evaluation may compute of an object.
+Part = Literal["contact", "clearance", "response", "first contact", "doubt"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +42,7 @@ class FrameResult:
         When it was recorded, seconds from the session's first frame.
     reason : str
         Why the frame could not be evaluated; empty if it was.
-    contacts : tuple of Contact
+    findings : tuple of Finding
         One for each object of the report, in its order; empty if there is a reason.
     stage_s : dict
         Seconds of work by stage. Cameras are decoded and segmented side by side: their seconds are
@@ -38,7 +52,7 @@ class FrameResult:
     index: int
     time_s: float
     reason: str
-    contacts: tuple[Contact, ...]
+    findings: tuple[Finding, ...]
     stage_s: dict[str, float]
 
     @property
@@ -64,6 +78,10 @@ class ReportHeader:
         The rig as it stands in rig.json.
     engine, renderer : str
         What answered the volume query.
+    parts : frozenset of str
+        What was computed of each object besides its contact.
+    cameras : tuple of str
+        The cameras, C of them, in the order of columns that have a number for each.
     versions : dict
         Versions of the software that took part.
     machine : str
@@ -76,5 +94,212 @@ class ReportHeader:
     rig: dict[str, Any]
     engine: str
     renderer: str
+    parts: frozenset[Part] = frozenset()
+    cameras: tuple[str, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
     machine: str = ""
+
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Column(Generic[T]):
+    """One dataset of the report.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the file, below the group of the frames or of the object.
+    unit : str
+        "1" where it has none.
+    kind : Kind
+        How far it can be trusted.
+    description : str
+        What it says, for whoever opens the file.
+    dtype : type
+        NumPy's; `str` for texts.
+    take : callable
+        Returns its value of one row; (n, *shape) for a column of points.
+    shape : tuple
+        Of one value; "C" stands for the number of cameras.
+    """
+
+    name: str
+    unit: str
+    kind: Kind
+    description: str
+    dtype: type
+    take: Callable[[T], Any]
+    shape: tuple[int | Literal["C"], ...] = ()
+
+    def shape_of(self, n_cameras: int) -> tuple[int, ...]:
+        """Return the shape of one value."""
+        return tuple(n_cameras if size == "C" else size for size in self.shape)
+
+    @property
+    def fill(self) -> Any:
+        """What stands where there is nothing to say: NaN, 0, False or an empty text."""
+        return np.nan if np.issubdtype(self.dtype, np.floating) else self.dtype()
+
+
+@dataclass(frozen=True, slots=True)
+class Table(Generic[T]):
+    """The columns of one part of a finding.
+
+    Attributes
+    ----------
+    part : str
+        What it belongs to: the columns of a part that an evaluation did not compute are absent.
+    of : callable
+        Returns that part of a finding; None where the frame has none.
+    columns : tuple of Column
+        One row a frame.
+    """
+
+    part: Part
+    of: Callable[[Finding], T | None]
+    columns: tuple[Column[T], ...]
+
+
+def _stage(name: str) -> Column[FrameResult]:
+    return Column(
+        f"stage_s/{name}",
+        "s",
+        "estimate",
+        f"seconds of work on the stage {name!r}, summed over the cameras",
+        np.float64,
+        lambda result: result.stage_s.get(name, 0.0),
+    )
+
+
+#: One row a frame.
+FRAME_COLUMNS: tuple[Column[FrameResult], ...] = (
+    Column(
+        "index",
+        "1",
+        "exact",
+        "number of the frame in the session",
+        np.uint32,
+        lambda result: result.index,
+    ),
+    Column(
+        "time_s",
+        "s",
+        "exact",
+        "time from the session's first frame",
+        np.float64,
+        lambda result: result.time_s,
+    ),
+    Column(
+        "valid",
+        "1",
+        "exact",
+        "whether the frame was evaluated",
+        np.bool_,
+        lambda result: result.is_valid,
+    ),
+    Column(
+        "reason",
+        "1",
+        "exact",
+        "why the frame was not evaluated",
+        str,
+        lambda result: result.reason,
+    ),
+    *(_stage(name) for name in STAGES),
+)
+
+_CONTACT: tuple[Column[Contact], ...] = (
+    Column(
+        "collides",
+        "1",
+        "sampled",
+        "whether a sample of its surface is in the hull",
+        np.bool_,
+        lambda contact: contact.collides,
+    ),
+    Column(
+        "n_points",
+        "1",
+        "sampled",
+        "number of collision points",
+        np.uint32,
+        lambda contact: len(contact.triangle),
+    ),
+    Column(
+        "n_triangles",
+        "1",
+        "sampled",
+        "number of triangles with a collision point",
+        np.uint32,
+        lambda contact: contact.n_triangles,
+    ),
+    Column(
+        "certificate",
+        "1",
+        "exact",
+        "colliding: a witness point is in every silhouette; free: proved, no point of the object "
+        "is in the hull; open: no disc of diameter open_at_m on its surface is in the hull; empty: "
+        "sampled only, or not evaluated",
+        str,
+        lambda contact: contact.certificate,
+    ),
+    Column(
+        "witness_m",
+        "m",
+        "exact",
+        "a point of the surface in every silhouette, world frame; NaN unless colliding",
+        np.float64,
+        lambda contact: contact.witness_world,
+        shape=(3,),
+    ),
+    Column(
+        "open_at_m",
+        "m",
+        "bound",
+        "no disc of this diameter on the surface is in the hull; NaN unless open",
+        np.float64,
+        lambda contact: contact.open_at_m,
+    ),
+)
+
+#: Of each object, one row a frame.
+TABLES: tuple[Table[Any], ...] = (Table("contact", lambda finding: finding.contact, _CONTACT),)
+
+#: Of each object, one row a collision point.
+POINT_COLUMNS: tuple[Column[Contact], ...] = (
+    Column(
+        "points/xyz_m",
+        "m",
+        "sampled",
+        "collision points CP_i, world frame",
+        np.float32,
+        lambda contact: contact.points_world,
+        shape=(3,),
+    ),
+    Column(
+        "points/triangle",
+        "1",
+        "sampled",
+        "number of the triangle that the collision point lies on",
+        np.uint32,
+        lambda contact: contact.triangle,
+    ),
+)
+
+#: Of each object, which points belong to which frame; made from the number of points.
+OFFSET: Column[NDArray[np.uint64]] = Column(
+    "points/offset",
+    "1",
+    "exact",
+    "the collision points of row f are points offset[f] to offset[f + 1]",
+    np.uint64,
+    lambda offset: offset,
+)
+
+
+def tables_of(parts: frozenset[Part]) -> tuple[Table[Any], ...]:
+    """Return the tables of an evaluation that computed `parts` besides the contact."""
+    there = {"contact", *parts}
+    return tuple(table for table in TABLES if table.part in there)

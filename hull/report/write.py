@@ -7,11 +7,13 @@ what stands, and the result is the same as that of a run that was never cut off.
 """
 
 import json
+import operator
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,7 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.hull.report.schema import FORMAT, STAGES, VERSION, FrameResult, ReportHeader
+from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.finding import Finding
+from hybridve.hull.report.schema import (
+    FORMAT,
+    FRAME_COLUMNS,
+    OFFSET,
+    POINT_COLUMNS,
+    VERSION,
+    Column,
+    FrameResult,
+    ReportHeader,
+    tables_of,
+)
 from hybridve.hull.report.vtk import add_vtkhdf, by_frame
 
 #: A part is finished after this many frames or collision points, whichever comes first.
@@ -110,12 +124,12 @@ class ReportWriter:
             )
         for part in self._part_paths():
             with np.load(part) as columns:
-                self.n_done += len(columns["index"])
+                self.n_done += len(columns[_frame_key("index")])
 
     def append(self, result: FrameResult) -> None:
         """Take in one frame's result."""
         self._pending.append(result)
-        n_points = sum(len(c.triangle) for r in self._pending for c in r.contacts)
+        n_points = sum(len(f.contact.triangle) for r in self._pending for f in r.findings)
         if len(self._pending) >= _PART_FRAMES or n_points >= _PART_POINTS:
             self._flush()
 
@@ -124,7 +138,7 @@ class ReportWriter:
         if not self._pending:
             return
         started = time.perf_counter()
-        columns = _columns(self._pending, len(self._header.objects))
+        columns = _columns(self._pending, self._header)
         part = self._parts / f"{self.n_done:09d}.npz"
         partial = part.with_suffix(".partial")
         with partial.open("wb") as file:
@@ -142,11 +156,11 @@ class ReportWriter:
     def _part_paths(self) -> list[Path]:
         return sorted(self._parts.glob("*.npz"))
 
-    def _part_columns(self, *starts: str) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield of each part the columns whose names begin with one of `starts`; no others load."""
+    def _part_columns(self, is_wanted: Callable[[str], bool]) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield of each part the columns that are wanted; no others load."""
         for part in self._part_paths():
             with np.load(part) as columns:
-                yield {name: columns[name] for name in columns.files if name.startswith(starts)}
+                yield {key: columns[key] for key in columns.files if is_wanted(key)}
 
     def finish(self) -> None:
         """Make the parts the report."""
@@ -177,120 +191,76 @@ class ReportWriter:
         ):
             text = file.create_dataset(f"hybridve/settings/{name}", data=json.dumps(value))
             text.attrs["unit"] = "1"
+            text.attrs["kind"] = "exact"
             text.attrs["description"] = description
 
-        rows = list(
-            self._part_columns(
-                "index",
-                "time_s",
-                "reason",
-                "stage_",
-                "n_points_",
-                "n_triangles_",
-                "certificate_",
-                "witness_",
-                "open_at_",
-            )
-        )
+        rows = list(self._part_columns(lambda key: not key.endswith(_POINT_NAMES)))
         if not rows:
             raise ReportError(f"{self._path}: no frame was evaluated; there is nothing to report")
-        frame = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+        whole = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
         frames = file.create_group("hybridve/frames")
-        _store(frames, "index", frame["index"], "1", "number of the frame in the session")
-        _store(frames, "time_s", frame["time_s"], "s", "time from the session's first frame")
-        _store(frames, "valid", frame["reason"] == "", "1", "whether the frame was evaluated")
-        _store_text(frames, "reason", frame["reason"], "why the frame was not evaluated")
-        for stage in STAGES:
-            _store(
-                frames,
-                f"stage_s/{stage}",
-                frame[f"stage_{stage}"],
-                "s",
-                f"seconds of work on the stage {stage!r}, summed over the cameras",
-            )
+        for column in FRAME_COLUMNS:
+            self._store(frames, column, whole[_frame_key(column.name)])
         objects = file.create_group("hybridve/objects", track_order=True)  # the scene's order
         for number, about in enumerate(header.objects):
             group = objects.create_group(about["name"])
             for name, value in about.items():
                 if name != "name":
                     group.attrs[name] = value
-            self._write_object(group, number, frame)
+            for table in tables_of(header.parts):
+                for column in table.columns:
+                    self._store(group, column, whole[_object_key(number, column.name)])
+            self._store_points(group, number, whole[_object_key(number, "n_points")])
         numbers = range(len(header.objects))
+        names = ("n_points", "points/xyz_m", "points/triangle")
         add_vtkhdf(
             file,
             (
                 by_frame(
-                    [columns[f"n_points_{number}"] for number in numbers],
-                    [columns[f"xyz_{number}"] for number in numbers],
-                    [columns[f"triangle_{number}"] for number in numbers],
+                    *([columns[_object_key(number, name)] for number in numbers] for name in names)
                 )
-                for columns in self._part_columns("n_points_", "xyz_", "triangle_")
+                for columns in self._part_columns(lambda key: key.endswith(names))
             ),
         )
 
-    def _write_object(self, group: h5py.Group, number: int, frame: dict[str, NDArray[Any]]) -> None:
-        n_points = frame[f"n_points_{number}"]
-        _store(
-            group, "collides", n_points > 0, "1", "whether a sample of its surface is in the hull"
-        )
-        _store(group, "n_points", n_points, "1", "number of collision points")
-        _store(
-            group,
-            "n_triangles",
-            frame[f"n_triangles_{number}"],
-            "1",
-            "number of triangles with a collision point",
-        )
-        _store_text(
-            group,
-            "certificate",
-            frame[f"certificate_{number}"],
-            "colliding: a witness point is in every silhouette; free: proved, no point of the "
-            "object is in the hull; open: no disc of diameter open_at_m on its surface is in the "
-            "hull; empty: sampled only, or not evaluated",
-        )
-        _store(
-            group,
-            "witness_m",
-            frame[f"witness_{number}"],
-            "m",
-            "a point of the surface in every silhouette, world frame; NaN unless colliding",
-        )
-        _store(
-            group,
-            "open_at_m",
-            frame[f"open_at_{number}"],
-            "m",
-            "no disc of this diameter on the surface is in the hull; NaN unless open",
-        )
+    def _store(self, group: h5py.Group, column: Column[Any], values: NDArray[Any]) -> None:
+        if column.dtype is str:
+            encoded = [str(text).encode() for text in values]
+            kind = h5py.string_dtype("utf-8", max(1, *(len(text) for text in encoded)))
+            values = np.array(encoded, kind)
+        dataset = group.create_dataset(column.name, data=values, chunks=True, **_STORED)
+        self._describe(dataset, column)
+
+    def _describe(self, dataset: h5py.Dataset, column: Column[Any]) -> None:
+        dataset.attrs["unit"] = column.unit
+        dataset.attrs["kind"] = column.kind
+        dataset.attrs["description"] = column.description
+        if "C" in column.shape:
+            dataset.attrs["cameras"] = list(self._header.cameras)
+
+    def _store_points(self, group: h5py.Group, number: int, n_points: NDArray[np.uint32]) -> None:
         offset = np.concatenate([[0], np.cumsum(n_points, dtype=np.uint64)]).astype(np.uint64)
-        _store(
-            group,
-            "points/offset",
-            offset,
-            "1",
-            "the collision points of row f are points offset[f] to offset[f + 1]",
-        )
+        self._store(group, OFFSET, offset)
         total = int(offset[-1])
         # Growing shapes only because HDF5 allows chunks larger than the data in no others.
         chunk = _CHUNK_POINTS if total > _CHUNK_POINTS else max(total, 1)
-        xyz = group.create_dataset(
-            "points/xyz_m", (total, 3), "f4", chunks=(chunk, 3), maxshape=(None, 3), **_STORED
-        )
-        xyz.attrs["unit"] = "m"
-        xyz.attrs["description"] = "collision points CP_i, world frame"
-        triangle = group.create_dataset(
-            "points/triangle", (total,), "u4", chunks=(chunk,), maxshape=(None,), **_STORED
-        )
-        triangle.attrs["unit"] = "1"
-        triangle.attrs["description"] = "number of the triangle that the collision point lies on"
-        start = 0
-        for columns in self._part_columns(f"xyz_{number}", f"triangle_{number}"):
-            stop = start + len(columns[f"triangle_{number}"])
-            if stop > start:
-                xyz[start:stop] = columns[f"xyz_{number}"]
-                triangle[start:stop] = columns[f"triangle_{number}"]
-            start = stop
+        for column in POINT_COLUMNS:
+            dataset = group.create_dataset(
+                column.name,
+                (total, *column.shape),
+                column.dtype,
+                chunks=(chunk, *column.shape),
+                maxshape=(None, *column.shape),
+                **_STORED,
+            )
+            self._describe(dataset, column)
+            key = _object_key(number, column.name)
+            start = 0
+            for columns in self._part_columns(partial(operator.eq, key)):
+                stop = start + len(columns[key])
+                if stop > start:
+                    dataset[start:stop] = columns[key]
+                start = stop
 
     def __enter__(self) -> Self:
         return self
@@ -328,51 +298,49 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
         raise ReportError(f"{path}: cannot be written: no permission to write to {folder}")
 
 
-def _columns(results: list[FrameResult], n_objects: int) -> dict[str, NDArray[Any]]:
+#: Ends of the keys under which a part keeps what belongs to collision points.
+_POINT_NAMES = tuple(column.name for column in POINT_COLUMNS)
+
+
+def _frame_key(name: str) -> str:
+    return f"frame/{name}"
+
+
+def _object_key(number: int, name: str) -> str:
+    return f"{number}/{name}"
+
+
+def _columns(results: list[FrameResult], header: ReportHeader) -> dict[str, NDArray[Any]]:
     """Return the arrays of one part."""
-    columns: dict[str, NDArray[Any]] = {
-        "index": np.array([result.index for result in results], np.uint32),
-        "time_s": np.array([result.time_s for result in results], np.float64),
-        "reason": np.array([result.reason for result in results], np.str_),
+    n_cameras = len(header.cameras)
+    columns = {
+        _frame_key(column.name): _values(column, results, n_cameras) for column in FRAME_COLUMNS
     }
-    for stage in STAGES:
-        columns[f"stage_{stage}"] = np.array(
-            [result.stage_s.get(stage, 0.0) for result in results], np.float64
-        )
-    for number in range(n_objects):
-        contacts = [r.contacts[number] if r.is_valid else None for r in results]
-        there = [contact for contact in contacts if contact is not None]
-        columns[f"n_points_{number}"] = np.array(
-            [len(c.triangle) if c is not None else 0 for c in contacts], np.uint32
-        )
-        columns[f"n_triangles_{number}"] = np.array(
-            [c.n_triangles if c is not None else 0 for c in contacts], np.uint32
-        )
-        columns[f"certificate_{number}"] = np.array(
-            [c.certificate if c is not None else "" for c in contacts], np.str_
-        )
-        columns[f"witness_{number}"] = np.array(
-            [c.witness_world if c is not None else np.full(3, np.nan) for c in contacts]
-        )
-        columns[f"open_at_{number}"] = np.array(
-            [c.open_at_m if c is not None else np.nan for c in contacts], np.float64
-        )
-        columns[f"xyz_{number}"] = np.concatenate(
-            [c.points_world for c in there] or [np.zeros((0, 3), np.float32)]
-        )
-        columns[f"triangle_{number}"] = np.concatenate(
-            [c.triangle for c in there] or [np.zeros(0, np.uint32)]
-        )
+    for number in range(len(header.objects)):
+        findings = [result.findings[number] if result.is_valid else None for result in results]
+        for table in tables_of(header.parts):
+            rows = [None if finding is None else table.of(finding) for finding in findings]
+            for column in table.columns:
+                columns[_object_key(number, column.name)] = _values(column, rows, n_cameras)
+        for points in POINT_COLUMNS:
+            columns[_object_key(number, points.name)] = _joined(points, findings)
     return columns
 
 
-def _store(group: h5py.Group, name: str, data: NDArray[Any], unit: str, description: str) -> None:
-    dataset = group.create_dataset(name, data=data, chunks=True, **_STORED)
-    dataset.attrs["unit"] = unit
-    dataset.attrs["description"] = description
+def _values(column: Column[Any], rows: Sequence[Any], n_cameras: int) -> NDArray[Any]:
+    """Return one value a row, (F, *shape)."""
+    if column.dtype is str:  # as wide as the longest text
+        return np.array(["" if row is None else column.take(row) for row in rows], np.str_)
+    values: NDArray[Any] = np.full(
+        (len(rows), *column.shape_of(n_cameras)), column.fill, column.dtype
+    )
+    for number, row in enumerate(rows):
+        if row is not None:
+            values[number] = column.take(row)
+    return values
 
 
-def _store_text(group: h5py.Group, name: str, data: NDArray[np.str_], description: str) -> None:
-    encoded = [str(text).encode() for text in data]
-    kind = h5py.string_dtype("utf-8", max(1, *(len(text) for text in encoded)))
-    _store(group, name, np.array(encoded, kind), "1", description)
+def _joined(column: Column[Contact], findings: Sequence[Finding | None]) -> NDArray[Any]:
+    """Return the values of all points of all rows, (P, *shape)."""
+    none: NDArray[Any] = np.zeros((0, *column.shape_of(0)), column.dtype)
+    return np.concatenate([none, *(column.take(f.contact) for f in findings if f is not None)])
