@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings
+from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.jit import FOLDER
@@ -62,6 +63,8 @@ def _run_kernels() -> None:
             hull = make_hull(views, [_mask()])
             detect_contacts(hull, [sheet], engine)
             certifier.certify_mesh(hull, sheet.triangles)
+    mesh = sheet.triangles
+    ClearanceMeter(mesh.vertices_world, mesh.faces, is_closed=False).measure(hull)
 
 
 def _views() -> Views:

@@ -1,0 +1,202 @@
+"""How far the hull is from a CAD object, between two bounds that are certain.
+
+The hull is given by its silhouettes alone, so no surface of it is built. Space around the object is
+cut into cubes, level after level (see `hybridve.hull.query.cells`). A cube is dropped once a
+camera proves that no point of the hull is in it, or once it cannot hold a point nearer to the CAD
+surface than the best one found, less the tolerance:
+
+* upper bound: a point of the hull, and the point of the surface nearest to it (both are returned);
+* lower bound: every point of the hull is in a cube that was dropped for its distance, and the
+  signed distance to the surface changes by at most a metre a metre.
+
+Of a closed object the distance is negative inside, so that the same search finds the deepest point
+of the hull beneath the surface. That depth is *not* the way that separates the two: a thin rod
+through the middle of a box is as deep as half the box is thick.
+
+Distances at the centres of cubes depend on the object alone. They are kept from frame to frame
+(`hybridve.hull.contact.distance`), in the object's frame, and serve wherever it is moved to. What
+is found depends on the hull, the object and its place only, never on what was asked before.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.hull.contact.distance import DistanceOctree, SurfaceDistance
+from hybridve.hull.query.cells import keep_near, make_best, make_cell_frame, split_cells
+from hybridve.hull.query.silhouettes import Hull
+
+#: Half of the root's edge at least, metres, and in sizes of the object: farther is not looked.
+_REACH_M, _REACH_SIZES = 16.0, 4.0
+
+#: Cubes with a half diagonal below this share of the tolerance are not cut any further.
+_SMALLEST_CELL = 1.0 / 16.0
+
+#: Cubes of one level at most. More are not cut; the bounds are then farther apart than asked.
+_MOST_CELLS = 1 << 19
+
+#: What rounding in double precision may add to a distance, in lengths of the reach.
+_ROUNDOFF = 64.0 * 2.0**-53
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clearance:
+    """How far the hull of one frame is from one object.
+
+    Attributes
+    ----------
+    lower_m, upper_m : float
+        Bounds of the distance between the hull and the surface, or the solid it bounds: both 0
+        where a point of the hull lies on or in it; the upper one inf where no hull was found, and
+        the lower one how far was looked.
+    on_object_world, on_hull_world : (3,) float64
+        The two points that the upper bound was measured between, metres; of a hull that reaches
+        into a closed object its deepest point, and the point of the surface nearest to that. NaN
+        if no hull was found.
+    depth_lower_m, depth_upper_m : float
+        Bounds of the depth of the hull's deepest point beneath the surface of a closed object;
+        both 0 where none is beneath it, NaN for an object that is not closed. It is no distance
+        that separates them.
+    """
+
+    lower_m: float
+    upper_m: float
+    on_object_world: NDArray[np.float64]
+    on_hull_world: NDArray[np.float64]
+    depth_lower_m: float
+    depth_upper_m: float
+
+    @property
+    def signed_m(self) -> tuple[float, float]:
+        """Bounds of the clearance less the depth."""
+        depth_lower_m, depth_upper_m = (
+            0.0 if np.isnan(depth) else depth for depth in (self.depth_lower_m, self.depth_upper_m)
+        )
+        return self.lower_m - depth_upper_m, self.upper_m - depth_lower_m
+
+
+class ClearanceMeter:
+    """Measures how far hulls are from one object, and remembers distances between frames.
+
+    Parameters
+    ----------
+    vertices_world : (V, 3) float64
+        Metres.
+    faces : (T, 3) int32
+        Vertex numbers; at least one triangle.
+    is_closed : bool
+        Whether the surface bounds a solid.
+    tolerance_m : float
+        How far apart the two bounds may be, above 0.
+
+    Raises
+    ------
+    ValueError
+        If the tolerance is not above 0 or there is no triangle.
+    """
+
+    def __init__(
+        self,
+        vertices_world: NDArray[np.float64],
+        faces: NDArray[np.int32],
+        *,
+        is_closed: bool,
+        tolerance_m: float = 1e-4,
+    ) -> None:
+        if not tolerance_m > 0:
+            raise ValueError(f"the tolerance is {tolerance_m} m, expected more than 0")
+        if len(faces) == 0:
+            raise ValueError("the object has no triangle to measure from")
+        used = vertices_world[faces.ravel()]
+        self._origin_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
+        size_m = float((used.max(axis=0) - used.min(axis=0)).max()) / 2.0
+        self.is_closed = is_closed
+        self.tolerance_m = tolerance_m
+        self._surface = SurfaceDistance(
+            vertices_world - self._origin_world, faces, is_closed=is_closed
+        )
+        self._octree = DistanceOctree(self._surface)
+        self._half_m = float(2.0 ** np.ceil(np.log2(max(_REACH_M, _REACH_SIZES * size_m))))
+        self._reach_m = self._half_m - size_m
+
+    def closest(
+        self, points_world: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Return the distances (N,) of points, the surface's nearest points (N, 3), triangles (N,).
+
+        All in metres, world frame; distances are not negative.
+        """
+        distance_m, nearest, triangle = self._surface.closest(points_world - self._origin_world)
+        return distance_m, nearest + self._origin_world, triangle
+
+    def signed_distance(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the distances (N,) of points (N, 3), metres, negative inside a closed object."""
+        return self._surface.signed(points_world - self._origin_world)[0]
+
+    def measure(
+        self,
+        hull: Hull,
+        shift_world: NDArray[np.float64] | None = None,
+        *,
+        stop_above_m: float = np.inf,
+        stop_below_m: float = -np.inf,
+    ) -> Clearance:
+        """Return how far the hull of a frame is from the object, moved by `shift_world` (3,).
+
+        Parameters
+        ----------
+        hull : Hull
+            The hull of one frame.
+        shift_world : (3,) float64, optional
+            Metres; the witnesses are those of the object in its moved place.
+        stop_above_m, stop_below_m : float
+            Stop early, with bounds farther apart than the tolerance, once the signed distance
+            (`Clearance.signed_m`) is certainly above the one or below the other.
+        """
+        shift_world = np.zeros(3) if shift_world is None else shift_world
+        origin_world = self._origin_world + shift_world
+        asked = make_cell_frame(hull, origin_world, self._half_m)
+        octree, best = self._octree, make_best()
+        if octree.is_large:
+            octree.forget()
+        number, center, half_m = np.zeros(1, np.int64), np.zeros((1, 3)), self._half_m
+        lowest_m = -np.inf
+        while len(number):
+            half_m /= 2.0
+            octree.make_room(8 * len(number))
+            part, part_center, inside, octree.n_nodes = split_cells(
+                number, center, half_m, octree.first_child, octree.n_nodes, asked
+            )
+            octree.fill(part, part_center)
+            number, center, lowest_m = keep_near(
+                part,
+                part_center,
+                inside,
+                half_m,
+                self.tolerance_m,
+                octree.distance_m,
+                octree.nearest,
+                best,
+                asked,
+            )
+            upper_m = best.distance_m[0]
+            lower_m = min(lowest_m, best.distance_m[1], upper_m)
+            if (
+                np.sqrt(3.0) * half_m < _SMALLEST_CELL * self.tolerance_m
+                or len(number) > _MOST_CELLS
+                or lower_m > stop_above_m
+                or upper_m < stop_below_m
+            ):
+                break
+        upper_m = float(best.distance_m[0])
+        lower_m = float(min(lowest_m, best.distance_m[1], upper_m, self._reach_m))
+        lower_m -= _ROUNDOFF * self._half_m
+        return Clearance(
+            lower_m=max(lower_m, 0.0),
+            upper_m=max(upper_m, 0.0),
+            on_object_world=best.points[1] + origin_world,
+            on_hull_world=best.points[0] + origin_world,
+            depth_lower_m=max(-upper_m, 0.0) if self.is_closed else np.nan,
+            depth_upper_m=max(-lower_m, 0.0) if self.is_closed else np.nan,
+        )

@@ -1,0 +1,354 @@
+"""Cells of space in the hull's sight: cubes that are cut into eight, and what is proved of each.
+
+A cube is *free* where the rectangle that it projects into holds no object pixel in some camera:
+then no point of it is in the hull. The argument is that of `hybridve.hull.query.bounds`, with
+another rectangle, which spares the projection of eight corners. Let p be the pixel of the cube's
+centre, h half of its edge, P the projection matrix, w the depth of the centre, and x = center + d
+with |d_j| <= h. Then the pixel of x is off p, along the image's rows, by
+
+    (P_1 . d - p_x P_3 . d) / (w + P_3 . d),
+
+at most h sum_j |P_1j - p_x P_3j| / w_min, where w_min = w - h sum_j |P_3j| is the smallest depth in
+the cube: exact to first order in h, and a proof at any h as long as w_min is positive.
+
+Rounding: p is off by at most 4.3 u (B_x + |p| B_z) / w, the bound of the offset by less than three
+times as much over w_min (B_k as in `bounds`, u the unit roundoff), so that a rectangle that is
+widened by 40 u (B_x + |p_x| B_z) / w_min holds the pixel of every point of the cube, and of every
+point that is computed within 16 u of one.
+
+A centre is called *inside* only where its pixel keeps 1e-7 px from the edges of its pixel in every
+camera, a thousand times what rounding moves it: whoever asks again gets the same answer.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.hull.jit import ZERO, compiled
+from hybridve.hull.query.clusters import make_frame
+from hybridve.hull.query.rectangles import ACCEPTS, REJECTS, UNDECIDED, Frame, rectangle_vote
+from hybridve.hull.query.silhouettes import Hull
+
+_PAD = 40.0 * 2.0**-53
+
+#: From this multiple of B_z on a depth is told from zero, rounding or not.
+_NEAR = 1000.0 * 2.0**-53
+
+#: A point this near to the edge of a pixel, in pixels, is not called inside.
+_EDGE_PX = 1e-7
+
+#: The tries that a centre in the hull makes towards the surface, in halves of its cube's edge.
+_TRIES = (1.0, 0.5, 0.25)
+
+
+class CellFrame(NamedTuple):
+    """The hull of one frame, asked about cells.
+
+    Attributes
+    ----------
+    frame : Frame
+        Silhouettes and projections.
+    pads : (C, 3) float64
+        40 u B_x, 40 u B_y and 40 u B_z of each camera, cameras as in the frame.
+    offset_local : (3,) float64
+        From the cells' frame to the local frame of the views, metres; the axes are parallel.
+    """
+
+    frame: Frame
+    pads: NDArray[np.float64]
+    offset_local: NDArray[np.float64]
+
+
+def make_cell_frame(hull: Hull, origin_world: NDArray[np.float64], reach_m: float) -> CellFrame:
+    """Return the hull of a frame as cells within `reach_m` of `origin_world`, their origin, ask it.
+
+    `reach_m` bounds each coordinate of any corner of a cell.
+    """
+    frame = make_frame(hull)
+    offset_local = origin_world - hull.views.origin_world
+    matrices = np.abs(frame.matrices.reshape(-1, 3, 4))
+    largest = matrices[:, :, :3] @ (np.abs(offset_local) + reach_m) + matrices[:, :, 3]
+    return CellFrame(frame, _PAD * largest, offset_local)
+
+
+class Best(NamedTuple):
+    """The hull's point nearest to the surface that was found so far, all in the cells' frame.
+
+    Attributes
+    ----------
+    distance_m : (2,) float64
+        Its signed distance; and the smallest lower bound of a cell that was dropped.
+    points : (2, 3) float64
+        The point, and the point of the surface nearest to it.
+    """
+
+    distance_m: NDArray[np.float64]
+    points: NDArray[np.float64]
+
+
+def make_best() -> Best:
+    """Return what is known before anything was asked: no point, nothing dropped."""
+    return Best(np.full(2, np.inf), np.full((2, 3), np.nan))
+
+
+@compiled
+def _is_inside(
+    x: float,
+    y: float,
+    z: float,
+    matrices: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    masks: NDArray[np.uint8],
+    mask_offset: NDArray[np.int64],
+    keep: bool,
+    min_cameras: int,
+) -> bool:
+    """Tell whether a point, local frame, is in the hull and clear of all edges of pixels."""
+    n_seen = ZERO
+    for camera in range(len(matrices)):
+        m = matrices[camera]
+        depth_m = m[8] * x + m[9] * y + m[10] * z + m[11]
+        if depth_m > 0:
+            width, height = sizes[camera, 0], sizes[camera, 1]
+            pixel_x = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth_m
+            pixel_y = (m[4] * x + m[5] * y + m[6] * z + m[7]) / depth_m
+            if -_EDGE_PX < pixel_x < width + _EDGE_PX and -_EDGE_PX < pixel_y < height + _EDGE_PX:
+                column, row = int(pixel_x), int(pixel_y)
+                if (
+                    not _EDGE_PX < pixel_x - column < 1.0 - _EDGE_PX
+                    or not _EDGE_PX < pixel_y - row < 1.0 - _EDGE_PX
+                    or not masks[mask_offset[camera] + row * width + column]
+                ):
+                    return False
+                n_seen += 1
+                continue
+        if not keep:
+            return False
+    return not keep or n_seen >= min_cameras
+
+
+@compiled
+def split_cells(
+    number: NDArray[np.int64],
+    center: NDArray[np.float64],
+    half_m: float,
+    first_child: NDArray[np.int64],
+    n_nodes: int,
+    asked: CellFrame,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]:
+    """Cut cells into eight and return the parts that are not proved free.
+
+    Parameters
+    ----------
+    number : (N,) int64
+        The cells' nodes in the octree.
+    center : (N, 3) float64
+        Their centres, metres, in the cells' frame.
+    half_m : float
+        Half of an edge of the parts.
+    first_child : (M,) int64
+        Per node of the octree the first of its eight parts, -1 where it has none yet; there is room
+        for all. Written.
+    n_nodes : int
+        How many nodes the octree has.
+    asked : CellFrame
+        The hull.
+
+    Returns
+    -------
+    number : (K,) int64
+        The nodes of the parts.
+    center : (K, 3) float64
+        Their centres.
+    inside : (K,) bool
+        Which centres are in the hull.
+    n_nodes : int
+        How many nodes the octree has now.
+    """
+    frame, pads = asked.frame, asked.pads
+    offset_x, offset_y, offset_z = asked.offset_local
+    matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
+    masks, mask_offset, integral_offset = frame.masks, frame.mask_offset, frame.integral_offset
+    keep, min_cameras, n_cameras = frame.keep, frame.min_cameras, len(frame.matrices)
+    part = np.zeros(8 * len(number), np.int64)
+    part_center = np.zeros((8 * len(number), 3))
+    inside = np.zeros(8 * len(number), np.bool_)
+    n_parts = 0
+    for i in range(len(number)):
+        first = first_child[number[i]]
+        if first < 0:
+            first = n_nodes
+            first_child[number[i]] = first
+            n_nodes += 8
+        for octant in range(8):
+            cell_x = center[i, 0] + (half_m if octant & 1 else -half_m)
+            cell_y = center[i, 1] + (half_m if octant & 2 else -half_m)
+            cell_z = center[i, 2] + (half_m if octant & 4 else -half_m)
+            x, y, z = cell_x + offset_x, cell_y + offset_y, cell_z + offset_z
+            is_free, n_accept, n_left = False, 0, 0
+            for camera in range(n_cameras):
+                m = matrices[camera]
+                width, height = sizes[camera, 0], sizes[camera, 1]
+                depth_m = m[8] * x + m[9] * y + m[10] * z + m[11]
+                thick_m = half_m * (abs(m[8]) + abs(m[9]) + abs(m[10]))
+                near_m = pads[camera, 2] * (_NEAR / _PAD) + 1e-30
+                if depth_m + thick_m <= -near_m:  # behind: never seen
+                    if keep:
+                        continue
+                    is_free = True
+                    break
+                low_x, low_y = -1.0, -1.0
+                high_x, high_y = float(width), float(height)
+                if depth_m - thick_m >= near_m:
+                    scale = 1.0 / (depth_m - thick_m)
+                    pixel_x = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth_m
+                    pixel_y = (m[4] * x + m[5] * y + m[6] * z + m[7]) / depth_m
+                    around_x = scale * (
+                        half_m
+                        * (
+                            abs(m[0] - pixel_x * m[8])
+                            + abs(m[1] - pixel_x * m[9])
+                            + abs(m[2] - pixel_x * m[10])
+                        )
+                        + pads[camera, 0]
+                        + abs(pixel_x) * pads[camera, 2]
+                    )
+                    around_y = scale * (
+                        half_m
+                        * (
+                            abs(m[4] - pixel_y * m[8])
+                            + abs(m[5] - pixel_y * m[9])
+                            + abs(m[6] - pixel_y * m[10])
+                        )
+                        + pads[camera, 1]
+                        + abs(pixel_y) * pads[camera, 2]
+                    )
+                    low_x, high_x = pixel_x - around_x, pixel_x + around_x
+                    low_y, high_y = pixel_y - around_y, pixel_y + around_y
+                vote = rectangle_vote(
+                    np.int64(np.floor(min(max(low_x, -1.0), width))),
+                    np.int64(np.floor(min(max(high_x, -1.0), width))),
+                    np.int64(np.floor(min(max(low_y, -1.0), height))),
+                    np.int64(np.floor(min(max(high_y, -1.0), height))),
+                    width,
+                    height,
+                    integral_offset[camera],
+                    integrals,
+                    keep,
+                )
+                if vote == REJECTS:
+                    is_free = True
+                    break
+                if vote == ACCEPTS:
+                    n_accept += 1
+                elif vote == UNDECIDED:
+                    n_left += 1
+            if is_free or (keep and n_accept + n_left < min_cameras):
+                continue
+            part[n_parts] = first + octant
+            part_center[n_parts, 0] = cell_x
+            part_center[n_parts, 1] = cell_y
+            part_center[n_parts, 2] = cell_z
+            inside[n_parts] = _is_inside(
+                x, y, z, matrices, sizes, masks, mask_offset, keep, min_cameras
+            )
+            n_parts += 1
+    return part[:n_parts], part_center[:n_parts], inside[:n_parts], n_nodes
+
+
+@compiled
+def keep_near(
+    number: NDArray[np.int64],
+    center: NDArray[np.float64],
+    inside: NDArray[np.bool_],
+    half_m: float,
+    tolerance_m: float,
+    distance_m: NDArray[np.float64],
+    nearest: NDArray[np.float64],
+    best: Best,
+    asked: CellFrame,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
+    """Take note of the hull's nearest point, and drop the cells that cannot hold a nearer one.
+
+    The signed distance to the surface changes by at most one metre a metre, so that no point of a
+    cell is nearer than its centre less half a diagonal.
+
+    Parameters
+    ----------
+    number, center, inside, half_m
+        Cells that are not free, as `split_cells` returns them.
+    tolerance_m : float
+        A cell that can better the best distance by no more than this is dropped.
+    distance_m : (M,) float64
+        Signed distances of the nodes' centres, negative inside the solid, metres.
+    nearest : (M, 3) float64
+        The points of the surface nearest to the nodes' centres, in the cells' frame.
+    best : Best
+        Written.
+    asked : CellFrame
+        The hull.
+
+    Returns
+    -------
+    number : (K,) int64
+    center : (K, 3) float64
+        The cells that are kept.
+    lowest_m : float
+        The smallest lower bound among them; inf if there is none.
+    """
+    frame = asked.frame
+    offset_x, offset_y, offset_z = asked.offset_local
+    matrices, sizes, masks, mask_offset = (
+        frame.matrices,
+        frame.sizes,
+        frame.masks,
+        frame.mask_offset,
+    )
+    keep, min_cameras = frame.keep, frame.min_cameras
+    smallest_m = best.distance_m[0]
+    for i in range(len(number)):
+        node = number[i]
+        if not inside[i] or distance_m[node] - half_m >= smallest_m:
+            continue
+        x, y, z, s = center[i, 0], center[i, 1], center[i, 2], distance_m[node]
+        to_x, to_y, to_z = nearest[node, 0] - x, nearest[node, 1] - y, nearest[node, 2] - z
+        way = 0.0
+        if s > 0:  # on the way to the nearest point of the surface, each metre brings a metre
+            for share in _TRIES:
+                along = min(share * half_m / s, 1.0)
+                if _is_inside(
+                    x + along * to_x + offset_x,
+                    y + along * to_y + offset_y,
+                    z + along * to_z + offset_z,
+                    matrices,
+                    sizes,
+                    masks,
+                    mask_offset,
+                    keep,
+                    min_cameras,
+                ):
+                    way = along
+                    break
+        if s - way * s < smallest_m:
+            smallest_m = s - way * s
+            best.points[0, 0] = x + way * to_x
+            best.points[0, 1] = y + way * to_y
+            best.points[0, 2] = z + way * to_z
+            for axis in range(3):
+                best.points[1, axis] = nearest[node, axis]
+    best.distance_m[0] = smallest_m
+    kept, kept_center = np.zeros(len(number), np.int64), np.zeros((len(number), 3))
+    n_kept, lowest_m, dropped_m = 0, np.inf, best.distance_m[1]
+    for i in range(len(number)):
+        lower_m = distance_m[number[i]] - np.sqrt(3.0) * half_m
+        if lower_m >= smallest_m - tolerance_m:
+            dropped_m = min(dropped_m, lower_m)
+            continue
+        lowest_m = min(lowest_m, lower_m)
+        kept[n_kept] = number[i]
+        for axis in range(3):
+            kept_center[n_kept, axis] = center[i, axis]
+        n_kept += 1
+    best.distance_m[1] = dropped_m
+    return kept[:n_kept], kept_center[:n_kept], lowest_m
