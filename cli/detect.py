@@ -78,6 +78,7 @@ def detect(
         EvaluateSettings,
         about_objects,
         about_rig,
+        computed_parts,
         count_frames,
         evaluate,
         make_chain,
@@ -107,6 +108,8 @@ def detect(
             rig=about_rig(chain),
             engine=query.name,
             renderer=query.renderer,
+            parts=computed_parts(settings),
+            cameras=chain.views.names,
             versions=software_versions(),
             machine=machine_text(),
         )

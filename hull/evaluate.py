@@ -8,13 +8,14 @@
 """
 
 import time
-from collections.abc import Callable, Generator
-from contextlib import closing, nullcontext
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.calib.lens import Undistortion, trimmed, undistortion
@@ -34,6 +35,7 @@ from hybridve.hull.capture.recording import (
 from hybridve.hull.capture.rig import load_rig, rig_digest
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.detect import (
     Body,
     Contact,
@@ -41,12 +43,12 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
-from hybridve.hull.contact.finding import Finding
+from hybridve.hull.contact.finding import Finding, agreed, approach_speed
 from hybridve.hull.contact.scene import Scene
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
-from hybridve.hull.query.silhouettes import Views, make_hull, make_views
-from hybridve.hull.report.schema import FrameResult
+from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
+from hybridve.hull.report.schema import FrameResult, Part
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +66,15 @@ class EvaluateSettings:
         viewport that keeps it.
     open_at_m : float or None
         Verdicts are certified down to discs of this diameter; None leaves them as sampled.
+    clearance_m : float or None
+        How far apart the bounds of the clearance may be; None leaves it unmeasured.
     """
 
     frames: FrameRange = field(default_factory=FrameRange)
     viewport: int | None = 10
     accuracy_m: float | None = None
     open_at_m: float | None = 1e-4
+    clearance_m: float | None = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +173,8 @@ def evaluate(
     engine : Engine
         What answers the volume query.
     skip : int
-        How many frames at the start are done already.
+        How many frames at the start are done already. The last of them is looked at again, since
+        the next one is compared with it.
     write_s : callable
         Tells how long was spent on writing since it was last asked; kept with the next frame.
     progress : callable, optional
@@ -179,40 +185,128 @@ def evaluate(
     SessionError
         If the recording has none of the frames asked for.
     """
-    n_yielded = 0
-    open_at_m = chain.settings.open_at_m
+    row = first = max(skip - 1, 0)
+    before: _Seen | None = None
     with (
-        Certifier(open_at_m) if open_at_m else nullcontext() as certifier,
-        closing(_silhouettes(chain, skip, progress)) as frames,
+        _Tools.of(chain, engine) as tools,
+        closing(_silhouettes(chain, first, progress)) as frames,
     ):
         for silhouettes in frames:
-            started = time.perf_counter()
-            contacts: list[Contact] = []
-            if silhouettes.masks is not None:
-                hull = make_hull(chain.views, silhouettes.masks)
-                contacts = detect_contacts(hull, chain.bodies, engine)
-            queried = time.perf_counter()
-            if certifier is not None and contacts:
-                contacts = certify_contacts(hull, chain.bodies, contacts, certifier)
-            yield FrameResult(
-                index=silhouettes.index,
-                time_s=silhouettes.index / chain.session.fps,
-                reason=silhouettes.reason,
-                findings=tuple(Finding(contact) for contact in contacts),
-                stage_s={
-                    "decode": silhouettes.decode_s,
-                    "segment": silhouettes.segment_s,
-                    "query": queried - started,
-                    "certify": time.perf_counter() - queried,
-                    "write": write_s(),
-                },
-            )
-            n_yielded += 1
-    if n_yielded + skip == 0:
+            watch = _Stopwatch(decode=silhouettes.decode_s, segment=silhouettes.segment_s)
+            seen = _look(chain, tools, silhouettes, watch)
+            if row >= skip:
+                findings = () if seen is None else _findings(chain, tools, before, seen, watch)
+                watch.stage_s["write"] = write_s()
+                yield FrameResult(
+                    index=silhouettes.index,
+                    time_s=silhouettes.index / chain.session.fps,
+                    reason=silhouettes.reason,
+                    findings=findings,
+                    stage_s=watch.stage_s,
+                )
+            before = seen
+            row += 1
+    if row == 0:
         raise SessionError(
             f"{chain.session.path}: the recording has none of the frames "
             f"{chain.settings.frames}; it may be empty or shorter"
         )
+
+
+class _Stopwatch:
+    """Seconds by stage."""
+
+    def __init__(self, **stage_s: float) -> None:
+        self.stage_s = stage_s
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Count the time since the last lap to a stage."""
+        now = time.perf_counter()
+        self.stage_s[stage] = self.stage_s.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tools:
+    """What is kept from frame to frame. No result depends on what was asked of it before."""
+
+    engine: Engine
+    certifier: Certifier | None
+    meters: list[ClearanceMeter]
+
+    @classmethod
+    @contextmanager
+    def of(cls, chain: Chain, engine: Engine) -> Iterator[Self]:
+        settings = chain.settings
+        meters = []
+        if settings.clearance_m is not None:
+            meters = [
+                ClearanceMeter(
+                    part.vertices_world,
+                    part.faces,
+                    is_closed=is_closed(part.vertices_world, part.faces),
+                    tolerance_m=settings.clearance_m,
+                )
+                for part in chain.scene.objects
+            ]
+        with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:
+            yield cls(engine, certifier, meters)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """One frame by itself."""
+
+    time_s: float
+    hull: Hull
+    contacts: list[Contact]
+    clearances: list[Clearance]
+
+
+def _look(
+    chain: Chain, tools: _Tools, silhouettes: FrameSilhouettes, watch: _Stopwatch
+) -> _Seen | None:
+    """Return what one frame says by itself, without those before; None if it cannot be read."""
+    if silhouettes.masks is None:
+        return None
+    hull = make_hull(chain.views, silhouettes.masks)
+    contacts = detect_contacts(hull, chain.bodies, tools.engine)
+    watch.lap("query")
+    if tools.certifier is not None:
+        contacts = certify_contacts(hull, chain.bodies, contacts, tools.certifier)
+    watch.lap("certify")
+    clearances = [meter.measure(hull) for meter in tools.meters]
+    if clearances:
+        pairs = [
+            agreed(contact, clearance)
+            for contact, clearance in zip(contacts, clearances, strict=True)
+        ]
+        contacts, clearances = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    watch.lap("clearance")
+    return _Seen(silhouettes.index / chain.session.fps, hull, contacts, clearances)
+
+
+def _findings(
+    chain: Chain, tools: _Tools, before: _Seen | None, seen: _Seen, watch: _Stopwatch
+) -> tuple[Finding, ...]:
+    """Return all about one frame, compared with the one before where that could be read."""
+    findings = []
+    for number, contact in enumerate(seen.contacts):
+        clearance = seen.clearances[number] if seen.clearances else None
+        approach_m_s = (np.nan, np.nan)
+        if clearance is not None and before is not None:
+            approach_m_s = approach_speed(
+                before.clearances[number], clearance, seen.time_s - before.time_s
+            )
+        findings.append(Finding(contact, clearance, approach_m_s))
+    return tuple(findings)
+
+
+def computed_parts(settings: EvaluateSettings) -> frozenset[Part]:
+    """Return what an evaluation computes of each object besides its contact."""
+    parts: dict[Part, bool] = {"clearance": settings.clearance_m is not None}
+    return frozenset(part for part, is_computed in parts.items() if is_computed)
 
 
 def count_frames(chain: Chain) -> int:
@@ -239,6 +333,7 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "viewport": chain.settings.viewport,
         "accuracy_m": chain.settings.accuracy_m,
         "open_at_m": chain.settings.open_at_m,
+        "clearance_m": chain.settings.clearance_m,
         "unseen": session.unseen,
         "min_cameras": session.min_cameras,
         "mask_threshold": session.mask_threshold,
@@ -277,9 +372,30 @@ def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
             "samples": int(body.triangles.topology.samples_before[-1]),
             "sample_spacing_m": body.spacing_m,
             "required_clearance_m": scene_object.required_clearance_m,
+            "closed": is_closed(scene_object.vertices_world, scene_object.faces),
         }
         for scene_object, body in zip(chain.scene.objects, chain.bodies, strict=True)
     )
+
+
+def is_closed(vertices_world: NDArray[np.float64], faces: NDArray[np.int32]) -> bool:
+    """Tell whether a mesh bounds a solid: every edge has two triangles, which agree on outside.
+
+    Parameters
+    ----------
+    vertices_world : (V, 3) float64
+        Vertices in the same place are one.
+    faces : (T, 3) int32
+        Vertex numbers; triangles that two of their corners share one place do not count.
+    """
+    _, welded = np.unique(vertices_world, axis=0, return_inverse=True)
+    corners = welded.reshape(-1)[faces]
+    distinct = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    corners = corners[distinct]
+    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
+    there, counts = np.unique(edges, axis=0, return_counts=True)
+    back = np.unique(edges[:, ::-1], axis=0)
+    return len(edges) > 0 and bool((counts == 1).all()) and np.array_equal(there, back)
 
 
 def _silhouettes(

@@ -12,6 +12,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.finding import Finding
 
@@ -19,7 +20,7 @@ FORMAT = "hybridve-report"
 VERSION = 1
 
 #: The stages whose seconds a report keeps, in the order in which a frame runs through them.
-STAGES = ("decode", "segment", "query", "certify", "write")
+STAGES = ("decode", "segment", "query", "certify", "clearance", "respond", "doubt", "write")
 
 #: How far a number can be trusted. "exact": what it says, to floating-point accuracy. "bound": the
 #: truth is on one side of it, or between two. "estimate": near the truth, by a model of errors or
@@ -264,8 +265,69 @@ _CONTACT: tuple[Column[Contact], ...] = (
     ),
 )
 
+_CLEARANCE: tuple[Column[Clearance], ...] = (
+    Column(
+        "clearance_m",
+        "m",
+        "bound",
+        "lower and upper bound of the distance from the hull to the object; 0, 0 while colliding "
+        "or inside; inf above where no hull was found; NaN where unknown",
+        np.float64,
+        lambda clearance: (clearance.lower_m, clearance.upper_m),
+        shape=(2,),
+    ),
+    Column(
+        "clearance_on_object_m",
+        "m",
+        "bound",
+        "point of the object's surface that the upper bound was measured from, world frame",
+        np.float64,
+        lambda clearance: clearance.on_object_world,
+        shape=(3,),
+    ),
+    Column(
+        "clearance_on_hull_m",
+        "m",
+        "bound",
+        "point of the hull that the upper bound was measured to, world frame; of a hull that is in "
+        "a closed object its deepest point",
+        np.float64,
+        lambda clearance: clearance.on_hull_world,
+        shape=(3,),
+    ),
+    Column(
+        "depth_m",
+        "m",
+        "bound",
+        "lower and upper bound of how far the deepest point of the hull lies beneath the surface "
+        "of a closed object, which is no distance that separates them; 0, 0 if none does; NaN if "
+        "the object is not closed",
+        np.float64,
+        lambda clearance: (clearance.depth_lower_m, clearance.depth_upper_m),
+        shape=(2,),
+    ),
+)
+
+_APPROACH: tuple[Column[Finding], ...] = (
+    Column(
+        "approach_m_s",
+        "m/s",
+        "bound",
+        "lower and upper bound of the mean speed at which hull and object came nearer since the "
+        "frame before, depth counting as negative distance; negative where they parted; NaN where "
+        "unknown",
+        np.float64,
+        lambda finding: finding.approach_m_s,
+        shape=(2,),
+    ),
+)
+
 #: Of each object, one row a frame.
-TABLES: tuple[Table[Any], ...] = (Table("contact", lambda finding: finding.contact, _CONTACT),)
+TABLES: tuple[Table[Any], ...] = (
+    Table("contact", lambda finding: finding.contact, _CONTACT),
+    Table("clearance", lambda finding: finding.clearance, _CLEARANCE),
+    Table("clearance", lambda finding: finding, _APPROACH),
+)
 
 #: Of each object, one row a collision point.
 POINT_COLUMNS: tuple[Column[Contact], ...] = (
