@@ -79,6 +79,26 @@ def spans_in_hull(
     return _joined(edges_m, _is_inside(hull, states))
 
 
+def contains_few(hull: Hull, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return what `hybridve.hull.query.reference.contains_points` does, of all cameras at once.
+
+    A third of its time for some thousand points, at more memory. The two may differ for points
+    that project onto the edge of a pixel but for rounding.
+
+    Parameters
+    ----------
+    hull : Hull
+        The visual hull of one frame.
+    points_world : (N, 3) float64
+        Points in metres.
+
+    Returns
+    -------
+    (N,) bool
+    """
+    return _is_inside(hull, _states(hull, points_world - hull.views.origin_world))
+
+
 def boundary_cameras(
     hull: Hull, point_world: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> tuple[int, ...]:
