@@ -11,7 +11,8 @@ surface than the best one found, less the tolerance:
 
 Of a closed object the distance is negative inside, so that the same search finds the deepest point
 of the hull beneath the surface. That depth is *not* the way that separates the two: a thin rod
-through the middle of a box is as deep as half the box is thick.
+through the middle of a box is as deep as half the box is thick. Its bounds hold, but they may be
+farther apart than the tolerance.
 
 Distances at the centres of cubes depend on the object alone. They are kept from frame to frame
 (`hybridve.hull.contact.distance`), in the object's frame, and serve wherever it is moved to. What
@@ -30,11 +31,17 @@ from hybridve.hull.query.silhouettes import Hull
 #: Half of the root's edge at least, metres, and in sizes of the object: farther is not looked.
 _REACH_M, _REACH_SIZES = 16.0, 4.0
 
-#: Cubes with a half diagonal below this share of the tolerance are not cut any further.
-_SMALLEST_CELL = 1.0 / 16.0
+#: Cubes with a half diagonal below this share of the tolerance are not cut any further. Where cones
+#: cross at a glancing angle the hull ends in a blade, which only cubes as thin as it is can tell
+#: from nothing.
+_SMALLEST_CELL = 2.0**-12
 
 #: Cubes of one level at most. More are not cut; the bounds are then farther apart than asked.
-_MOST_CELLS = 1 << 19
+_MOST_CELLS = 1 << 17
+
+#: The same once the hull is certain to reach into the solid. Depth is constant all along the middle
+#: of a plate, which takes as many cubes as it is wide and long: it is left less exact.
+_MOST_DEEP_CELLS = 1 << 13
 
 #: What rounding in double precision may add to a distance, in lengths of the reach.
 _ROUNDOFF = 64.0 * 2.0**-53
@@ -184,7 +191,7 @@ class ClearanceMeter:
             lower_m = min(lowest_m, best.distance_m[1], upper_m)
             if (
                 np.sqrt(3.0) * half_m < _SMALLEST_CELL * self.tolerance_m
-                or len(number) > _MOST_CELLS
+                or len(number) > (_MOST_CELLS if upper_m >= 0 else _MOST_DEEP_CELLS)
                 or lower_m > stop_above_m
                 or upper_m < stop_below_m
             ):

@@ -129,6 +129,43 @@ def _is_inside(
 
 
 @compiled
+def _is_beside(
+    x: float,
+    y: float,
+    z: float,
+    half_m: float,
+    m: NDArray[np.float64],
+    pads: NDArray[np.float64],
+    width_px: int,
+    height_px: int,
+) -> bool:
+    """Tell whether a cube that the camera's own plane cuts lies beside the image, wholly.
+
+    Where the depth w is positive, a point is left of the image if its homogeneous x is negative,
+    right of it if x - width w is positive: linear in the point, so no division by depth is needed.
+    """
+    for axis in range(2):
+        row, size = 4 * axis, float(width_px if axis == 0 else height_px)
+        for border in range(2):
+            far = size * border
+            sign = 1.0 if border else -1.0
+            form = sign * (
+                (m[row] - far * m[8]) * x
+                + (m[row + 1] - far * m[9]) * y
+                + (m[row + 2] - far * m[10]) * z
+                + (m[row + 3] - far * m[11])
+            )
+            around = half_m * (
+                abs(m[row] - far * m[8])
+                + abs(m[row + 1] - far * m[9])
+                + abs(m[row + 2] - far * m[10])
+            )
+            if form - around > pads[axis] + far * pads[2]:
+                return True
+    return False
+
+
+@compiled
 def split_cells(
     number: NDArray[np.int64],
     center: NDArray[np.float64],
@@ -198,8 +235,6 @@ def split_cells(
                         continue
                     is_free = True
                     break
-                low_x, low_y = -1.0, -1.0
-                high_x, high_y = float(width), float(height)
                 if depth_m - thick_m >= near_m:
                     scale = 1.0 / (depth_m - thick_m)
                     pixel_x = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth_m
@@ -226,6 +261,14 @@ def split_cells(
                     )
                     low_x, high_x = pixel_x - around_x, pixel_x + around_x
                     low_y, high_y = pixel_y - around_y, pixel_y + around_y
+                elif _is_beside(x, y, z, half_m, m, pads[camera], width, height):
+                    if keep:
+                        continue
+                    is_free = True
+                    break
+                else:
+                    low_x, low_y = -1.0, -1.0
+                    high_x, high_y = float(width), float(height)
                 vote = rectangle_vote(
                     np.int64(np.floor(min(max(low_x, -1.0), width))),
                     np.int64(np.floor(min(max(high_x, -1.0), width))),
