@@ -1,0 +1,428 @@
+"""The connected volumes of a hull, and which of them must hold something real.
+
+A visual hull holds all that could be there: where rays of different things cross, volumes arise
+that hold nothing (phantom volumes). What can be proved is the contrary. Let the silhouettes be
+right: an object pixel's ray meets something real, and whatever is real lies in the hull. Then an
+object pixel whose ray meets one volume of the hull and no other proves that this volume holds
+something real. A volume of which every pixel has another volume behind or before it may be a
+phantom; it need not be one.
+
+Silhouettes are sampled at the centres of pixels, so a real thing can stick out of their hull by a
+part of a pixel. Everything here is therefore asked of the hull whose silhouettes are grown by one
+pixel (`grown`). That holds whatever is real, if it is not thinner than a pixel.
+
+Volumes are connected cells: space is cut into cubes, coarse to fine, and a cube is kept unless one
+camera sees no object pixel in the rectangle around its projection. What is connected in the hull
+is connected in cells, so volumes that are told apart are apart; two that come nearer to each other
+than some two cells may be told as one, which can make a phantom part of something real.
+
+The rectangle
+-------------
+Let c be the centre of a cube of half side s, h = P c + p its homogeneous projection and x = h_x /
+h_z. A point of the cube is c + o with |o_j| <= s, and its x differs from the centre's by
+
+    (P_x o - x P_z o) / (h_z + P_z o),  at most  s sum_j |P_xj - x P_zj| / (h_z - s sum_j |P_zj|),
+
+y alike: an exact bound at a sixth of the work of projecting eight corners.
+
+References
+----------
+Miller and Hilton, *Safe hulls*, 4th European Conference on Visual Media Production, 2007.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.walk import spans_in_hull
+
+#: By how much silhouettes are grown: a thing's outline is within a pixel of its sampled one.
+GROWN_PX = 1
+
+#: Side of the cells that volumes are made of.
+CELL_M = 0.02
+
+#: Cells are looked for as far as so many times the farthest camera's distance from the middle.
+_REACH = 2.0
+
+#: Twice as many cells along each side from level to level; the coarsest are 2^7 cells wide.
+_LEVELS = 7
+
+#: Cubes of one level, and cells of the box around all volumes, at most.
+_MOST_OPEN, _MOST_CELLS = 1 << 18, 1 << 22
+
+#: A cube nearer than this to a camera's plane is not projected: it stays.
+_NEAR_M = 1e-3
+
+#: Rounding of a rectangle in double precision is below 1e-8 px for what is not nearer.
+_ROUNDING_PX = 1e-6
+
+#: Coverage is drawn in blocks of so many pixels a side.
+_BLOCK_PX = 4
+
+#: Rays that are walked to prove one volume, at most: one in right silhouettes does.
+_MOST_RAYS = 16
+
+#: As far as a ray is walked.
+FAR_M = 1e3
+
+#: What holds a point, where no volume does.
+NOWHERE = -1
+
+
+def grown(hull: Hull, by_px: int = GROWN_PX) -> Hull:
+    """Return the hull of silhouettes that are larger by some pixels all round (and diagonally)."""
+    around = np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)
+    return make_hull(
+        hull.views,
+        [
+            np.asarray(cv2.dilate(hull.mask(camera), around), np.uint8)
+            for camera in range(len(hull.views))
+        ],
+    )
+
+
+def pixel_ray(
+    views: Views, camera: int, column: int, row: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the ray of a pixel's centre: where it begins, metres, and a unit vector; world."""
+    matrix = views.img_from_local[camera]
+    origin_world = views.origin_world - np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    direction = np.linalg.solve(matrix[:, :3], [column + 0.5, row + 0.5, 1.0])
+    return origin_world, direction / np.linalg.norm(direction)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Volumes:
+    """The connected volumes of one frame's hull.
+
+    Attributes
+    ----------
+    hull : Hull
+        The hull that was cut into cells, with silhouettes already grown.
+    cell_m : float
+        Side of a cell, metres.
+    first : (3,) int64
+        Which cell ``number[0, 0, 0]`` is: cell i spans i * cell_m to (i + 1) * cell_m along each
+        axis of the local frame of the views.
+    number : (X, Y, Z) int32
+        Which volume each cell belongs to, 1 for the first; 0 where nothing is.
+    """
+
+    hull: Hull
+    cell_m: float
+    first: NDArray[np.int64]
+    number: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return int(self.number.max(initial=0))
+
+    def at(self, points_world: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the volumes that hold points, (N, 3) metres to (N,), from 0; else `NOWHERE`."""
+        local = (points_world - self.hull.views.origin_world) / self.cell_m
+        limit = 2.0**40  # beyond any cell, and still a number that an index can be
+        cell = np.floor(np.clip(np.nan_to_num(local, nan=limit), -limit, limit)).astype(np.int64)
+        cell -= self.first
+        is_within = np.asarray(((cell >= 0) & (cell < self.number.shape)).all(axis=1))
+        x, y, z = np.where(is_within[:, None], cell, 0).T
+        found = np.full(len(points_world), NOWHERE, np.int64)
+        if self.number.size:
+            found = np.where(is_within, self.number[x, y, z].astype(np.int64) - 1, NOWHERE)
+        return found
+
+    def surface_local(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the cells that have an empty neighbour: centres (N, 3) and their volumes (N,).
+
+        Metres, local frame. Whatever ray meets a volume from outside meets one of these.
+        """
+        taken = np.pad(np.asarray(self.number > 0), 1)
+        middle = slice(1, -1)
+        within = np.asarray(self.number > 0)
+        for side in (slice(None, -2), slice(2, None)):
+            within &= taken[side, middle, middle] & taken[middle, side, middle]
+            within &= taken[middle, middle, side]
+        index = np.argwhere((self.number > 0) & ~within)
+        centers = np.asarray((index + self.first + 0.5) * self.cell_m, np.float64)
+        return centers, self.number[tuple(index.T)].astype(np.int64) - 1
+
+
+def connected_volumes(grown_hull: Hull, cell_m: float = CELL_M) -> Volumes:
+    """Return the connected volumes of a hull, in cells that touch at a face, an edge or a corner.
+
+    Parameters
+    ----------
+    grown_hull : Hull
+        As `grown` returns it.
+    cell_m : float
+        Side of a cell, metres. Cells are twice, four times, .. as wide where there would be too
+        many of them: around a hull that fills a hall.
+
+    Raises
+    ------
+    ValueError
+        If the cells have no size.
+    """
+    if not cell_m > 0:
+        raise ValueError(f"cell_m is {cell_m}, expected a positive length")
+    blocks = [(cells, side) for cells, side in _occupied(grown_hull, cell_m) if len(cells)]
+    if not blocks:
+        nothing = np.zeros((0, 0, 0), np.int32)
+        return Volumes(grown_hull, cell_m, np.zeros(3, np.int64), nothing)
+    first = np.min([cells.min(axis=0) for cells, _ in blocks], axis=0)
+    last = np.max([(cells + side).max(axis=0) for cells, side in blocks], axis=0)
+    unit = 1
+    while np.prod(-(-last // unit) - first // unit, dtype=np.float64) > _MOST_CELLS:
+        unit *= 2
+    first, last = first // unit, -(-last // unit)
+    is_taken = np.zeros(last - first, np.bool_)
+    for cells, side in blocks:
+        width = max(1, side // unit)  # both are powers of two, and blocks begin at multiples
+        offsets = np.indices((width, width, width)).reshape(3, -1)
+        x, y, z = ((cells // unit - first)[:, :, None] + offsets).transpose(1, 0, 2).reshape(3, -1)
+        is_taken[x, y, z] = True
+    number, _ = ndimage.label(is_taken, structure=np.ones((3, 3, 3)))
+    return Volumes(grown_hull, cell_m * unit, first, np.asarray(number, np.int32))
+
+
+def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
+    """Return cubes that are not proved free: first cells (N, 3), and how many cells wide."""
+    matrices = hull.views.img_from_local
+    centers_local = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0]
+    reach_m = _REACH * float(np.linalg.norm(centers_local, axis=1).max())
+    side = 1 << _LEVELS
+    most = max(1, int(np.ceil(reach_m / (side * cell_m))))
+    index = np.indices((2 * most, 2 * most, 2 * most)).reshape(3, -1).T
+    cells = (index - most) * side
+    octants = np.indices((2, 2, 2)).reshape(3, -1).T
+    blocks = []
+    while True:
+        is_free, is_full = _tell(hull, np.asarray(cells + 0.5 * side) * cell_m, 0.5 * side * cell_m)
+        if side == 1:
+            blocks.append((cells[~is_free], 1))
+            return blocks
+        blocks.append((cells[is_full], side))
+        is_open = ~(is_free | is_full)
+        if 8 * np.count_nonzero(is_open) > _MOST_OPEN:
+            blocks.append((cells[is_open], side))
+            return blocks
+        side //= 2
+        cells = (cells[is_open, None] + octants * side).reshape(-1, 3)
+
+
+def _tell(
+    hull: Hull, centers_local: NDArray[np.float64], half_m: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which cubes (N, 3) hold no point of the hull, proved, and which hold nothing else."""
+    views = hull.views
+    keeps = views.unseen == "keep"
+    is_free = np.zeros(len(centers_local), np.bool_)
+    may_see = np.zeros(len(centers_local), np.int64)
+    n_full = np.zeros(len(centers_local), np.int64)
+    rest = np.arange(len(centers_local))  # not free so far
+    for camera in range(len(views)):
+        seen, full, none = _look(hull, camera, centers_local[rest], half_m)
+        may_see[rest] += seen
+        n_full[rest] += full
+        is_free[rest] = none if keeps else none | ~seen
+        rest = rest[~is_free[rest]]
+    if not keeps:
+        return is_free, n_full == len(views)
+    is_free |= may_see < views.min_cameras
+    return is_free, ~is_free & (n_full == may_see) & (n_full >= views.min_cameras)
+
+
+def _look(
+    hull: Hull, camera: int, centers_local: NDArray[np.float64], half_m: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return of which cubes a camera may see a point; sees object only; sees background only."""
+    width, height = hull.views.sizes_px[camera].tolist()
+    matrix = hull.views.img_from_local[camera]
+    x, y, reach_x, reach_y, near_m, far_m = _rectangles(matrix, centers_local, half_m)
+    in_front = near_m > _NEAR_M
+    left, right = np.floor(x - reach_x), np.floor(x + reach_x)
+    top, bottom = np.floor(y - reach_y), np.floor(y + reach_y)
+    is_seen_wholly = in_front & (left >= 0) & (top >= 0) & (right < width) & (bottom < height)
+    # What straddles the camera's plane projects anywhere.
+    left, top = np.where(in_front, left, 0.0), np.where(in_front, top, 0.0)
+    right, bottom = np.where(in_front, right, width), np.where(in_front, bottom, height)
+    x0 = np.clip(left, 0, width).astype(np.int64)
+    x1 = np.clip(right + 1, 0, width).astype(np.int64)
+    y0 = np.clip(top, 0, height).astype(np.int64)
+    y1 = np.clip(bottom + 1, 0, height).astype(np.int64)
+    may_see = (x0 < x1) & (y0 < y1) & (far_m > -_NEAR_M)
+    straddles = np.flatnonzero(may_see & ~in_front)
+    may_see[straddles] = _may_be_seen(matrix, width, height, centers_local[straddles], half_m)
+    integral = hull.integral(camera).ravel()
+    stride = width + 1
+    count = (
+        integral[y1 * stride + x1]
+        - integral[y0 * stride + x1]
+        - integral[y1 * stride + x0]
+        + integral[y0 * stride + x0]
+    )
+    sees_none = count == 0
+    if hull.views.unseen == "keep":
+        sees_none &= is_seen_wholly  # beyond its border a camera abstains
+    return may_see, is_seen_wholly & (count == (x1 - x0) * (y1 - y0)), sees_none & may_see
+
+
+def _may_be_seen(
+    matrix: NDArray[np.float64],
+    width: int,
+    height: int,
+    centers_local: NDArray[np.float64],
+    half_m: float,
+) -> NDArray[np.bool_]:
+    """Tell which cubes (N, 3) may hold a point that projects into the image: (N,).
+
+    Such a point is on the inner side of each of the four planes through the camera's centre and
+    the image's borders. A cube is beyond a plane if its innermost corner is; by `_NEAR_M` in
+    homogeneous pixels, to be sure of rounding.
+    """
+    x, y, depth = matrix
+    inward = np.stack([x, width * depth - x, y, height * depth - y])  # (4, 4)
+    innermost = centers_local @ inward[:, :3].T + inward[:, 3]
+    innermost += half_m * np.abs(inward[:, :3]).sum(axis=1)
+    return np.asarray((innermost >= -_NEAR_M).all(axis=1))
+
+
+def _rectangles(
+    matrix: NDArray[np.float64], centers_local: NDArray[np.float64], half_m: float
+) -> tuple[NDArray[np.float64], ...]:
+    """Return x, y of centres, reach in x and in y, nearest and farthest depth: (N,) each.
+
+    Pixels, where the nearest depth is above `_NEAR_M`; see this file's head.
+    """
+    h_x, h_y, depth_m = matrix[:, :3] @ centers_local.T + matrix[:, 3:]  # (N,) each
+    reach_z = half_m * np.abs(matrix[2, :3]).sum()
+    near_m, far_m = depth_m - reach_z, depth_m + reach_z
+    in_front = near_m > _NEAR_M
+    divisor = np.where(in_front, depth_m, 1.0)
+    x, y = h_x / divisor, h_y / divisor
+    divisor = np.where(in_front, near_m, 1.0)
+    reach = []
+    for row, middle in ((matrix[0], x), (matrix[1], y)):
+        spread = np.zeros(len(x))
+        for axis in range(3):
+            spread += np.abs(row[axis] - middle * matrix[2, axis])
+        reach.append(half_m * spread / divisor + _ROUNDING_PX)
+    return x, y, reach[0], reach[1], near_m, far_m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """Which volume alone can explain what a camera sees, in blocks of `_BLOCK_PX` pixels a side.
+
+    Attributes
+    ----------
+    sole : list of C (H', W') int64
+        The volume, from 0; `NOWHERE` where there is none or more than one.
+    """
+
+    sole: list[NDArray[np.int64]]
+
+
+def cover(volumes: Volumes) -> Coverage:
+    """Return which blocks of each image are covered by the cells of one volume only.
+
+    A cell covers the rectangle around its projection. Three sums over the cells that cover a
+    block, of 1, of their volumes' numbers l and of l^2, tell whether all numbers are the same:
+    just then is n sum l^2 = (sum l)^2 (Cauchy and Schwarz). Sums over rectangles are cumulated
+    from their corners.
+    """
+    if len(volumes) == 1:
+        sizes = -(-volumes.hull.views.sizes_px // _BLOCK_PX)
+        return Coverage([np.zeros((height, width), np.int64) for width, height in sizes])
+    centers_local, volume = volumes.surface_local()
+    sole = []
+    for camera, (width, height) in enumerate(volumes.hull.views.sizes_px.tolist()):
+        matrix = volumes.hull.views.img_from_local[camera]
+        x, y, reach_x, reach_y, near_m, far_m = _rectangles(
+            matrix, centers_local, 0.5 * volumes.cell_m
+        )
+        columns, rows = -(-width // _BLOCK_PX), -(-height // _BLOCK_PX)
+        in_front = near_m > _NEAR_M
+        x0, x1 = _blocks(x, reach_x, in_front, columns)
+        y0, y1 = _blocks(y, reach_y, in_front, rows)
+        drawn = far_m > -_NEAR_M
+        stride = columns + 1
+        corners = np.concatenate(
+            [y0 * stride + x0, y1 * stride + x1, y0 * stride + x1, y1 * stride + x0]
+        )
+        signs = np.repeat([1.0, 1.0, -1.0, -1.0], len(x)) * np.tile(drawn, 4)
+        sums = []
+        for power in range(3):
+            # Integers below 2^53, and so exact: fewer than 2^20 cells of 2^15 volumes over a block.
+            weights = signs * np.tile((volume + 1.0) ** power, 4)
+            flat = np.bincount(corners, weights, (rows + 1) * stride)
+            image = flat.reshape(rows + 1, stride).cumsum(axis=0).cumsum(axis=1)
+            sums.append(np.round(image[:rows, :columns]))
+        n, first, second = sums
+        is_sole = (n > 0) & (n * second == first * first)
+        sole.append(np.where(is_sole, first / np.maximum(n, 1.0) - 1.0, NOWHERE).astype(np.int64))
+    return Coverage(sole)
+
+
+def _blocks(
+    middle: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    in_front: NDArray[np.bool_],
+    count: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first block that each rectangle touches, and the one after its last."""
+    first = np.where(in_front, np.floor((middle - reach) / _BLOCK_PX), 0)
+    last = np.where(in_front, np.floor((middle + reach) / _BLOCK_PX) + 1, count)
+    return (
+        np.clip(first, 0, count).astype(np.int64),
+        np.clip(last, 0, count).astype(np.int64),
+    )
+
+
+def is_real(hull: Hull, volumes: Volumes, coverage: Coverage, volume: int) -> bool:
+    """Tell whether right silhouettes prove that a volume holds something real.
+
+    Object pixels in blocks that no other volume covers are tried until one's ray is in the hull,
+    and in this volume wherever it is.
+
+    Parameters
+    ----------
+    hull : Hull
+        The hull of the frame, silhouettes as they are: its object pixels are asked.
+    volumes, coverage
+        Those of the same frame.
+    volume : int
+        The one asked about, from 0.
+    """
+    per_camera = max(1, _MOST_RAYS // len(hull.views))
+    for camera in range(len(hull.views)):
+        blocks = np.argwhere((coverage.sole[camera] == volume) & _has_object(hull, camera))
+        chosen = np.linspace(0, len(blocks) - 1, min(per_camera, len(blocks)))
+        for row, column in (blocks[chosen.round().astype(np.int64)] * _BLOCK_PX).tolist():
+            block = hull.mask(camera)[row : row + _BLOCK_PX, column : column + _BLOCK_PX]
+            inner_row, inner_column = np.argwhere(block)[0].tolist()
+            if _is_all_in(volumes, camera, column + inner_column, row + inner_row, volume):
+                return True
+    return False
+
+
+def _has_object(hull: Hull, camera: int) -> NDArray[np.bool_]:
+    """Tell which blocks of an image hold an object pixel, (H', W')."""
+    integral = hull.integral(camera)
+    height, width = integral.shape
+    rows = np.append(np.arange(0, height - 1, _BLOCK_PX), height - 1)
+    columns = np.append(np.arange(0, width - 1, _BLOCK_PX), width - 1)
+    corners = integral[np.ix_(rows, columns)]
+    return np.asarray(np.diff(np.diff(corners, axis=0), axis=1) > 0)
+
+
+def _is_all_in(volumes: Volumes, camera: int, column: int, row: int, volume: int) -> bool:
+    """Tell whether the ray of a pixel's centre is in the hull, and there in one volume only."""
+    origin_world, direction = pixel_ray(volumes.hull.views, camera, column, row)
+    spans_m = spans_in_hull(volumes.hull, origin_world, direction, FAR_M)
+    # A stretch in the hull is connected: its middle tells for all of it.
+    middles_world = origin_world + spans_m.mean(axis=1)[:, None] * direction
+    return len(spans_m) > 0 and bool((volumes.at(middles_world) == volume).all())

@@ -1,0 +1,674 @@
+"""How far a contact or a clearance can be trusted: what outlines, cameras and bulges do to it.
+
+The clearance of `hybridve.hull.contact.clearance` is that of the hull, and certain to a tenth of a
+millimetre. What it says of the real thing depends on the silhouettes, the calibration, and on what
+a hull is: everything that could be there. Here stands how much. Each number is one of these:
+
+* **exact**: cameras that see a point; whether a verdict stands without a camera;
+* **bound**, given right silhouettes (an object pixel's ray meets something real, and whatever is
+  real lies in the hull of silhouettes grown by one pixel; see `hybridve.hull.contact.components`):
+  how far away the real thing is at most; that a volume holds something real;
+* **estimate**: the standard deviation of the clearance, and what it is at least at 95 %.
+
+What an outline does to the clearance
+-------------------------------------
+Let x be the hull's point nearest to the object, y the object's point nearest to x, and
+u = (y - x) / |y - x|. The hull is an intersection of cones, one a camera. At x it ends where some
+of them end; let m_k be their outward normals. As x is nearest, u cannot have a part that leads on
+through the hull (Karush, Kuhn and Tucker):
+
+    u = sum_k lambda_k m_k,   lambda_k >= 0.
+
+If cone k moves outward at x by s_k metres, the clearance falls by lambda_k s_k, to first order: the
+multipliers are the sensitivities. An outline that moves outward by one pixel moves its cone by
+
+    s_k = |l|,   J_k^T l = m_k,
+
+where J_k (2, 3) holds the derivatives of the pixel by the point: a step along m_k by one metre
+moves the projection by 1 / |l| pixels along the outline's normal. lambda is found by non-negative
+least squares over the cameras that have background within `_NEAR_PX` of x's projection.
+
+Pixels make stairs of an outline, and x is the corner of a step; m_k is that of the smoothed outline
+(`hybridve.hull.query.walk.silhouette_normal`). Where no combination comes within `_MOST_RESIDUAL`
+of u (fingertips of a few pixels, holes), the clearance is measured again with the silhouette of
+each of these cameras grown by one pixel all round, which moves straight outlines by 1 to 1.4 px.
+
+Where the hull reaches into a closed object, the same holds of the deepest point, with u reversed:
+the signed clearance falls as the depth grows.
+
+What moves an outline
+---------------------
+Per camera, in pixels, taken to be independent from camera to camera: `OutlineErrors`. Independent,
+they add up in squares: ``std_m ** 2 = sum (mm_per_px[k] * sigma_px[k]) ** 2``. The lower bound less
+1.645 of these is what the clearance is at least, at 95 % on one side.
+
+What is not in it: a silhouette that is wrong by more than its outline (a hand cut off, a chair that
+was not there before) has no standard deviation; the last numbers, of cameras left out, tell what
+hangs on one silhouette. A covariance of the poses is not known to any rig so far; how far its
+corners were missed stands in for it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
+from hybridve.hull.contact.components import (
+    CELL_M,
+    FAR_M,
+    NOWHERE,
+    Coverage,
+    Volumes,
+    connected_volumes,
+    cover,
+    grown,
+    is_real,
+    pixel_ray,
+)
+from hybridve.hull.contact.detect import Contact
+from hybridve.hull.query.reference import contains_points
+from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.query.walk import silhouette_normal, spans_in_hull
+
+#: One-sided 95 % of a normal distribution, in standard deviations.
+ONE_SIDED_95 = 1.645
+
+#: A camera ends the hull at a point if background lies this near to the point's projection. The
+#: nearest point is a corner of the hull's pixel stairs, up to 1.4 pixels beside each outline.
+_NEAR_PX = 1.5
+
+#: Non-negative combinations of the cones' normals that are farther than this from the direction to
+#: the object (a unit vector) explain it badly: about 20 degrees.
+_MOST_RESIDUAL = 0.35
+
+#: Nearer than this there is no direction from the hull to the object.
+_NO_DIRECTION_M = 1e-7
+
+#: Where rays are tried for a bound of the real thing's distance: at the nearest point's projection,
+#: and in the most promising cameras at these distances about it, in eight directions.
+_RINGS_PX = (2.5, 7.0)
+_AROUND = np.array([(np.cos(k * np.pi / 4.0), np.sin(k * np.pi / 4.0)) for k in range(8)])
+_CLOSE_CAMERAS = 2
+
+#: So many of these rays, the most promising, are measured closely; to this many metres.
+_CLOSE_RAYS = 6
+_CLOSE_M = 1e-3
+
+#: Rounds of halving a ray's steps, and steps of the first.
+_MOST_ROUNDS, _FIRST_STEPS = 12, 8
+
+#: Collision points that are asked whether they stand without a camera.
+_MOST_POINTS = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class DoubtSettings:
+    """What is assumed of silhouettes and cameras that tell nothing themselves.
+
+    Attributes
+    ----------
+    segmentation_px : float
+        Standard deviation of an outline about the true one. On the horseman recording our
+        outlines are 1.4 to 2.1 px (by camera) off those painted by hand, where they are less than
+        8 px off; hands have erred by about a pixel themselves.
+    calibration_px : float
+        Standard deviation of a projection along one axis, for cameras whose rig does not tell.
+    cell_m : float
+        Volumes that are nearer to each other than some two of these may be told as one.
+    """
+
+    segmentation_px: float = 1.5
+    calibration_px: float = 0.5
+    cell_m: float = CELL_M
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutlineErrors:
+    """Standard deviations of where each camera's outline is, across the outline, in pixels.
+
+    Attributes
+    ----------
+    calibration_px : (C,) float64
+        Of a projection along one axis.
+    is_measured : (C,) bool
+        Whether that comes from the rig; else it is assumed.
+    segmentation_px : float
+        Of the outline in the image.
+    lens_px : (C,) float64
+        Of undistorting the silhouette, whose shift is bounded: even within that bound.
+    """
+
+    calibration_px: NDArray[np.float64]
+    is_measured: NDArray[np.bool_]
+    segmentation_px: float
+    lens_px: NDArray[np.float64]
+
+    #: Of an outline that is rounded to whole pixels: even within half a pixel.
+    quantisation_px = 1.0 / np.sqrt(12.0)
+
+    @property
+    def sigma_px(self) -> NDArray[np.float64]:
+        """All of it together, (C,)."""
+        variance = self.calibration_px**2 + self.lens_px**2
+        return np.asarray(np.sqrt(variance + self.segmentation_px**2 + self.quantisation_px**2))
+
+
+def outline_errors(
+    names: Sequence[str],
+    provenance: Mapping[str, Any],
+    mask_shift_px: Sequence[float | None],
+    settings: DoubtSettings | None = None,
+) -> OutlineErrors:
+    """Return how far outlines may be off, as far as the rig tells.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The cameras, C of them.
+    provenance : mapping
+        Where the rig comes from (`hybridve.calib.rig.Rig`). How far the corners of the board were
+        missed is taken from ``cameras.NAME.{intrinsics,extrinsics}.rms_px``, the larger one, or
+        from ``check.rms_px.NAME`` of a rig made elsewhere; these are lengths, and an outline cares
+        for one axis only.
+    mask_shift_px : sequence of C floats or None
+        Bounds of `hybridve.calib.lens_bound`; None where there is none, which counts as a pixel.
+    settings : DoubtSettings, optional
+        What is assumed where the rig does not tell.
+    """
+    settings = settings or DoubtSettings()
+    missed_px = np.array([_missed_px(provenance, name) for name in names])
+    is_measured = np.isfinite(missed_px)
+    shift_px = np.array([1.0 if shift is None else shift for shift in mask_shift_px], np.float64)
+    return OutlineErrors(
+        np.where(is_measured, missed_px / np.sqrt(2.0), settings.calibration_px),
+        is_measured,
+        settings.segmentation_px,
+        shift_px / np.sqrt(3.0),
+    )
+
+
+def _missed_px(provenance: Mapping[str, Any], name: str) -> float:
+    """Return the rms length by which a camera's corners were missed; NaN where nobody knows."""
+    of_camera = provenance.get("cameras", {}).get(name, {})
+    told = [of_camera.get(kind, {}).get("rms_px") for kind in ("intrinsics", "extrinsics")]
+    told.append(provenance.get("check", {}).get("rms_px", {}).get(name))
+    return max((float(value) for value in told if value is not None), default=np.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubt:
+    """How far one object's contact or clearance in one frame can be trusted.
+
+    Attributes
+    ----------
+    std_m : float
+        Estimate: standard deviation of the clearance (of the depth, where the hull reaches into a
+        closed object). NaN where no clearance is known, or there is no direction from the hull to
+        the surface.
+    at_least_m : float
+        Estimate: what the clearance is at least, at 95 %; not below 0. NaN with `std_m`.
+    real_upper_m : float
+        Bound, given right silhouettes: the real thing is not farther away than this; 0 if it
+        certainly reaches into a closed object; inf where no ray tells.
+    mm_per_px : (C,) float64
+        Estimate: by how many metres the clearance falls when a camera's outline moves outward by
+        one pixel.
+    is_remeasured : bool
+        Whether the latter were found by measuring again with silhouettes grown by a pixel, because
+        the outlines' directions do not explain the direction to the object.
+    n_seeing : int
+        Exact: how many cameras see the contact, or the hull's nearest point.
+    survives : bool
+        Exact: whether the verdict, touched or not, stands with any one camera left out.
+    hinges_on : tuple of str
+        Exact: the cameras without which it does not.
+    component : "real", "unsure" or ""
+        Bound, given right silhouettes: "real" if the volume that touches or is nearest is proved to
+        hold something real; "unsure" if each pixel it explains is explained by another volume, too,
+        as of a phantom; "" where there is no volume, or it is too far away to be looked at.
+    """
+
+    std_m: float
+    at_least_m: float
+    real_upper_m: float
+    mm_per_px: NDArray[np.float64]
+    is_remeasured: bool
+    n_seeing: int
+    survives: bool
+    hinges_on: tuple[str, ...]
+    component: Literal["real", "unsure", ""]
+
+
+class Doubter:
+    """Doubts the contacts of a recording, frame by frame.
+
+    Parameters
+    ----------
+    errors : OutlineErrors
+        Of the cameras.
+    settings : DoubtSettings, optional
+        Those that `errors` were made with.
+    """
+
+    def __init__(self, errors: OutlineErrors, settings: DoubtSettings | None = None) -> None:
+        self._errors = errors
+        self._settings = settings or DoubtSettings()
+
+    def frame(self, hull: Hull) -> "FrameDoubts":
+        """Return one that doubts all objects of a frame; what they share is computed once."""
+        return FrameDoubts(hull, self._errors, self._settings)
+
+
+@dataclass(eq=False)
+class FrameDoubts:
+    """Doubts all objects of one frame. Nothing is computed before an object asks for it."""
+
+    hull: Hull
+    errors: OutlineErrors
+    settings: DoubtSettings
+    _is_real: dict[int, bool] = field(default_factory=dict, init=False)
+
+    @cached_property
+    def grown(self) -> Hull:
+        """The hull of silhouettes grown by one pixel."""
+        return grown(self.hull)
+
+    @cached_property
+    def volumes(self) -> Volumes:
+        """Its connected volumes."""
+        return connected_volumes(self.grown, self.settings.cell_m)
+
+    @cached_property
+    def _coverage(self) -> Coverage:
+        return cover(self.volumes)
+
+    @cached_property
+    def _fewer(self) -> list[Hull]:
+        """The hulls without one camera each."""
+        return [without_camera(self.hull, camera) for camera in range(len(self.hull.views))]
+
+    def doubt(self, meter: ClearanceMeter, contact: Contact, clearance: Clearance) -> Doubt:
+        """Return how far an object's contact and clearance can be trusted.
+
+        Parameters
+        ----------
+        meter : ClearanceMeter
+            Of the object.
+        contact : Contact
+            Of the object in this frame.
+        clearance : Clearance
+            Of the object in this frame.
+        """
+        sensitivity_m, is_remeasured = self._sensitivity(meter, clearance)
+        std_m = float(np.sqrt(((sensitivity_m * self.errors.sigma_px) ** 2).sum()))
+        points_world = _touching_points(contact)
+        if len(points_world):
+            hinges_on = self._contact_hinges_on(points_world)
+        elif clearance.upper_m > 0:
+            hinges_on = self._freedom_hinges_on(meter)
+        else:  # swallowed by a closed object, which no sample on its surface tells
+            hinges_on = self._contact_hinges_on(clearance.on_hull_world[None])
+        if len(points_world) == 0 and np.isfinite(clearance.on_hull_world).all():
+            points_world = clearance.on_hull_world[None]
+        return Doubt(
+            std_m=std_m,
+            at_least_m=max(0.0, clearance.lower_m - ONE_SIDED_95 * std_m)
+            if np.isfinite(std_m)
+            else np.nan,
+            real_upper_m=real_upper(self.hull, self.grown, meter, clearance),
+            mm_per_px=sensitivity_m,
+            is_remeasured=is_remeasured,
+            n_seeing=_count_seeing(self.hull.views, points_world[0]) if len(points_world) else 0,
+            survives=not hinges_on,
+            hinges_on=hinges_on,
+            component=self._component(points_world),
+        )
+
+    def _sensitivity(
+        self, meter: ClearanceMeter, clearance: Clearance
+    ) -> tuple[NDArray[np.float64], bool]:
+        """Return metres per pixel (C,), and whether they were measured anew."""
+        n_cameras = len(self.hull.views)
+        toward = clearance.on_object_world - clearance.on_hull_world
+        distance_m = float(np.linalg.norm(toward))
+        if not distance_m > _NO_DIRECTION_M:  # or NaN
+            return np.full(n_cameras, np.nan), False
+        is_inside = clearance.upper_m <= 0 and clearance.depth_lower_m > 0
+        direction = toward / (-distance_m if is_inside else distance_m)
+        sensitivity_m, residual = outline_sensitivity(self.hull, clearance.on_hull_world, direction)
+        if is_inside and not sensitivity_m.any():
+            return sensitivity_m, False  # the deepest point there can be: no outline ends it
+        if residual <= _MOST_RESIDUAL:
+            return sensitivity_m, False
+        for camera in range(n_cameras):
+            if _is_near_background(self.hull, camera, clearance.on_hull_world):
+                then = meter.measure(self._grown_in(camera))
+                sensitivity_m[camera] = max(0.0, clearance.signed_m[1] - then.signed_m[1])
+        return sensitivity_m, True
+
+    def _grown_in(self, camera: int) -> Hull:
+        """Return the hull with one camera's silhouette grown by a pixel."""
+        masks_flat, integrals_flat = self.hull.masks_flat.copy(), self.hull.integrals_flat.copy()
+        changed = replace(self.hull, masks_flat=masks_flat, integrals_flat=integrals_flat)
+        changed.mask(camera)[:] = self.grown.mask(camera)
+        changed.integral(camera)[:] = self.grown.integral(camera)
+        return changed
+
+    def _contact_hinges_on(self, points_world: NDArray[np.float64]) -> tuple[str, ...]:
+        """Return the cameras without which no known point of a contact is left."""
+        views = self.hull.views
+        if len(views) == 1:
+            return views.names
+        if views.unseen == "carve":
+            return ()  # a camera only carves: without it the hull is larger
+        return tuple(
+            name
+            for name, fewer in zip(views.names, self._fewer, strict=True)
+            if not contains_points(fewer, points_world).any()
+        )
+
+    def _freedom_hinges_on(self, meter: ClearanceMeter) -> tuple[str, ...]:
+        """Return the cameras without which an object is not certainly free."""
+        views = self.hull.views
+        if len(views) == 1:
+            return views.names
+        return tuple(
+            name
+            for name, fewer in zip(views.names, self._fewer, strict=True)
+            if not meter.measure(fewer, stop_above_m=0.0, stop_below_m=0.0).lower_m > 0
+        )
+
+    def _component(self, points_world: NDArray[np.float64]) -> Literal["real", "unsure", ""]:
+        """Return whether one of the volumes that hold points is proved to hold something real."""
+        held_by = np.unique(self.volumes.at(points_world))
+        held_by = held_by[held_by != NOWHERE]
+        if len(held_by) == 0:
+            return ""
+        return "real" if any(self._proves(int(volume)) for volume in held_by) else "unsure"
+
+    def _proves(self, volume: int) -> bool:
+        if volume not in self._is_real:
+            self._is_real[volume] = is_real(self.hull, self.volumes, self._coverage, volume)
+        return self._is_real[volume]
+
+
+def _touching_points(contact: Contact) -> NDArray[np.float64]:
+    """Return points of a contact (P, 3), the witness first; evenly chosen where there are many."""
+    points_world = contact.points_world
+    if len(points_world) > _MOST_POINTS:
+        chosen = np.linspace(0, len(points_world) - 1, _MOST_POINTS).round().astype(np.int64)
+        points_world = points_world[chosen]
+    witness_world = contact.witness_world[None]
+    if not np.isfinite(witness_world).all():
+        witness_world = np.zeros((0, 3))
+    return np.concatenate([witness_world, points_world.astype(np.float64)])
+
+
+def _count_seeing(views: Views, point_world: NDArray[np.float64]) -> int:
+    """Return how many cameras see a point."""
+    projected = views.img_from_local @ np.append(point_world - views.origin_world, 1.0)  # (C, 3)
+    depth_m = projected[:, 2:]
+    seen = (depth_m > 0) & (projected[:, :2] >= 0) & (projected[:, :2] < views.sizes_px * depth_m)
+    return int(seen.all(axis=1).sum())
+
+
+def without_camera(hull: Hull, camera: int) -> Hull:
+    """Return the hull of all cameras but one; images are shared, not copied.
+
+    Where ``min_cameras`` asks for all of them, it asks for one less.
+
+    Raises
+    ------
+    ValueError
+        If there is only one.
+    """
+    views = hull.views
+    if len(views) < 2:
+        raise ValueError("there is one camera; without it there is no hull")
+    rest = np.delete(np.arange(len(views)), camera)
+    fewer = Views(
+        tuple(views.names[k] for k in rest),
+        views.sizes_px[rest],
+        views.img_from_local[rest],
+        views.origin_world,
+        views.unseen,
+        min(views.min_cameras, len(rest)),
+    )
+    return replace(
+        hull,
+        views=fewer,
+        mask_offset=hull.mask_offset[rest],
+        integral_offset=hull.integral_offset[rest],
+    )
+
+
+def outline_sensitivity(
+    hull: Hull, point_world: NDArray[np.float64], direction: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Return how far the hull's extreme point moves as outlines do, and how well that is explained.
+
+    Parameters
+    ----------
+    hull : Hull
+        The hull of one frame.
+    point_world : (3,) float64
+        The point of the hull that lies farthest along the direction, metres.
+    direction : (3,) float64
+        Unit vector in the world's frame.
+
+    Returns
+    -------
+    m_per_px : (C,) float64
+        By how many metres the hull reaches farther when a camera's outline moves outward by a
+        pixel: ``lambda_k s_k`` of this file's head.
+    residual : float
+        How far the combination of normals is from the direction; 1 where no camera ends the hull.
+    """
+    views = hull.views
+    m_per_px = np.zeros(len(views))
+    cameras, normals = [], []
+    for camera in range(len(views)):
+        if _is_near_background(hull, camera, point_world):
+            normal = silhouette_normal(hull, camera, point_world)
+            if np.isfinite(normal).all():
+                cameras.append(camera)
+                normals.append(normal)
+    if not cameras:
+        return m_per_px, 1.0
+    multipliers, residual = nnls(np.stack(normals, axis=1), direction)
+    for camera, normal, multiplier in zip(cameras, normals, multipliers, strict=True):
+        m_per_px[camera] = multiplier * metres_per_pixel(views, camera, point_world, normal)
+    return m_per_px, float(residual)
+
+
+def metres_per_pixel(
+    views: Views, camera: int, point_world: NDArray[np.float64], normal: NDArray[np.float64]
+) -> float:
+    """Return how far a silhouette cone moves at a point when its outline moves by one pixel.
+
+    Parameters
+    ----------
+    views : Views
+        The cameras.
+    camera : int
+        The one whose outline moves.
+    point_world : (3,) float64
+        A point on its cone, in front of it, metres.
+    normal : (3,) float64
+        The cone's normal there: a unit vector across the ray.
+    """
+    matrix = views.img_from_local[camera]
+    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    pixel = projected[:2] / projected[2]
+    derivatives = (matrix[:2, :3] - pixel[:, None] * matrix[2, :3]) / projected[2]  # (2, 3)
+    line, *_ = np.linalg.lstsq(derivatives.T, normal, rcond=None)
+    return float(np.linalg.norm(line))
+
+
+def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64]) -> bool:
+    """Tell whether a camera sees background within `_NEAR_PX` of a point that it sees."""
+    views = hull.views
+    matrix = views.img_from_local[camera]
+    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    if not projected[2] > 0:
+        return False
+    x, y = projected[:2] / projected[2]
+    mask = hull.mask(camera)
+    height, width = mask.shape
+    if not (0 <= x < width and 0 <= y < height):
+        return False
+    reach = np.arange(-int(_NEAR_PX) - 1, int(_NEAR_PX) + 2)
+    columns, rows = int(x) + reach, int(y) + reach
+    # To the nearest point of each pixel's square.
+    away_x = np.maximum(np.maximum(columns - x, x - columns - 1), 0.0)
+    away_y = np.maximum(np.maximum(rows - y, y - rows - 1), 0.0)
+    is_near = away_x**2 + away_y[:, None] ** 2 <= _NEAR_PX**2
+    is_within = (columns >= 0) & (columns < width) & ((rows >= 0) & (rows < height))[:, None]
+    value = mask[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)]
+    beyond_ends = views.unseen == "carve"
+    is_background = np.where(is_within, value == 0, beyond_ends)
+    return bool((is_near & is_background).any())
+
+
+def real_upper(hull: Hull, grown_hull: Hull, meter: ClearanceMeter, clearance: Clearance) -> float:
+    """Return how far away from the object the real thing is at most, given right silhouettes.
+
+    The ray of an object pixel's centre meets something real, in the hull of silhouettes grown by
+    one pixel. So something real is no farther away than the farthest point of that ray in that
+    hull; any ray gives a bound. Rays of pixels about the hull's nearest point are tried.
+
+    Along a ray distances change by at most a metre a metre: between two points ``step`` apart at
+    distances a and b there is none above (a + b + step) / 2.
+
+    Parameters
+    ----------
+    hull, grown_hull : Hull
+        Of one frame; see `hybridve.hull.contact.components.grown`.
+    meter : ClearanceMeter
+        Of the object.
+    clearance : Clearance
+        Of the object in this frame.
+
+    Returns
+    -------
+    float
+        Metres, not below the clearance's lower bound; 0 if it certainly reaches into a closed
+        object, inf if there is no ray.
+    """
+    if not np.isfinite(clearance.on_hull_world).all():
+        return np.inf
+
+    def promises(asked: list[tuple[int, int, int]]) -> list[_Promise]:
+        return [
+            _Promise(promise_m, camera, ray)
+            for camera, column, row in asked
+            if (ray := _walk_pixel(grown_hull, camera, column, row)) is not None
+            for promise_m in [float(meter.signed_distance(ray.ends_world).max())]
+        ]
+
+    pixels = [
+        _pixels_about(hull, camera, clearance.on_hull_world) for camera in range(len(hull.views))
+    ]
+    tried = promises([(camera, *found[0]) for camera, found in enumerate(pixels) if found])
+    best = sorted(tried, key=lambda promise: promise.at_least_m)[:_CLOSE_CAMERAS]
+    tried += promises([(p.camera, *pixel) for p in best for pixel in pixels[p.camera][1:]])
+    bound_m = np.inf
+    for promise in sorted(tried, key=lambda promise: promise.at_least_m)[:_CLOSE_RAYS]:
+        if promise.at_least_m >= bound_m:
+            break
+        bound_m = min(bound_m, _farthest(meter, promise.ray, bound_m))
+    return max(bound_m, clearance.lower_m)
+
+
+class _Ray(NamedTuple):
+    """A pixel's ray, and the stretches (N, 2) of it that lie in the hull, metres."""
+
+    origin_world: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    spans_m: NDArray[np.float64]
+
+    def at(self, along_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points (K, 3), metres."""
+        return self.origin_world + along_m[:, None] * self.direction
+
+    @property
+    def ends_world(self) -> NDArray[np.float64]:
+        """Where its stretches begin and end, (2 N, 3) metres."""
+        return self.at(self.spans_m.ravel())
+
+
+class _Promise(NamedTuple):
+    """What a ray's bound is not below, metres: the farther of its ends."""
+
+    at_least_m: float
+    camera: int
+    ray: _Ray
+
+
+def _walk_pixel(grown_hull: Hull, camera: int, column: int, row: int) -> _Ray | None:
+    """Return the ray of a pixel; None where the silhouettes contradict each other."""
+    origin_world, direction = pixel_ray(grown_hull.views, camera, column, row)
+    spans_m = spans_in_hull(grown_hull, origin_world, direction, FAR_M)
+    return _Ray(origin_world, direction, spans_m) if len(spans_m) else None
+
+
+def _pixels_about(
+    hull: Hull, camera: int, point_world: NDArray[np.float64]
+) -> list[tuple[int, int]]:
+    """Return object pixels, columns and rows, at and about the projection of a point, in turn."""
+    views = hull.views
+    matrix = views.img_from_local[camera]
+    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    width, height = views.sizes_px[camera].tolist()
+    if not projected[2] > 0:
+        return []
+    with np.errstate(over="ignore"):
+        middle = projected[:2] / projected[2]
+    if not ((middle >= 0) & (middle < (width, height))).all():
+        return []
+    asked = [middle] + [middle + ring * around for ring in _RINGS_PX for around in _AROUND]
+    mask = hull.mask(camera)
+    found = []
+    for column, row in np.floor(asked).astype(np.int64).tolist():
+        is_seen = 0 <= column < width and 0 <= row < height
+        if is_seen and mask[row, column] and (column, row) not in found:
+            found.append((column, row))
+    return found
+
+
+def _farthest(meter: ClearanceMeter, ray: _Ray, enough_m: float) -> float:
+    """Return a bound of the signed distance along stretches of a ray, to `_CLOSE_M`.
+
+    It is given up, with infinity, where it is certainly above `enough_m`.
+    """
+    begin, end = ray.spans_m.T
+    steps = np.linspace(begin, end, _FIRST_STEPS + 1, axis=1)  # (N, K)
+    distances_m = meter.signed_distance(ray.at(steps.ravel())).reshape(steps.shape)
+    begin, end = steps[:, :-1].ravel(), steps[:, 1:].ravel()
+    at_begin, at_end = distances_m[:, :-1].ravel(), distances_m[:, 1:].ravel()
+    reached_m = float(distances_m.max())
+    settled_m = -np.inf
+    for _ in range(_MOST_ROUNDS):
+        upper_m = 0.5 * (at_begin + at_end + (end - begin))
+        is_open = upper_m > reached_m + _CLOSE_M
+        settled_m = max(settled_m, float(upper_m[~is_open].max(initial=-np.inf)))
+        if not is_open.any():
+            return settled_m
+        if reached_m >= enough_m:
+            return np.inf
+        begin, end = begin[is_open], end[is_open]
+        at_begin, at_end = at_begin[is_open], at_end[is_open]
+        middle = 0.5 * (begin + end)
+        at_middle = meter.signed_distance(ray.at(middle))
+        reached_m = max(reached_m, float(at_middle.max()))
+        begin, end = np.concatenate([begin, middle]), np.concatenate([middle, end])
+        at_begin, at_end = (
+            np.concatenate([at_begin, at_middle]),
+            np.concatenate([at_middle, at_end]),
+        )
+    return max(settled_m, float((0.5 * (at_begin + at_end + (end - begin))).max()))
