@@ -259,3 +259,35 @@ def test_forgetting_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hybridve.hull.contact.distance._MOST_NODES", 100)
     forgetting = ClearanceMeter(vertices, faces, is_closed=True)
     assert [forgetting.measure(hull).signed_m for hull in hulls] == expected
+
+
+@pytest.mark.parametrize("voxel_m", [0.01, 0.005])
+def test_a_peer_agrees_to_the_resolution_of_its_mesh(voxel_m: float) -> None:
+    """python-fcl between the CAD and a surface of the same hull by marching cubes.
+
+    A surface point lies in a cell of the grid with a sample inside and one outside: within a
+    diagonal of the hull, as the hull of a ball is thicker than the grid is wide.
+    """
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    views = ring_views(4)
+    vertices, faces = box((0.3, 0.2, 0.25), (0, 0, 0))
+    meter = ClearanceMeter(vertices, faces, is_closed=True)
+    peer = trimesh.collision.CollisionManager()
+    peer.add_object("cad", trimesh.Trimesh(vertices, faces, process=False))
+    line = np.arange(-0.1, 0.1 + voxel_m, voxel_m)
+    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
+    rng = np.random.default_rng(3)
+    for _ in range(6):
+        direction = rng.normal(size=3)
+        center = direction / np.linalg.norm(direction) * rng.uniform(0.3, 0.4)
+        hull = make_hull(views, ball_masks(views, center, 0.05))
+        inside = contains_points(hull, grid + center).reshape((len(line),) * 3)
+        corners, triangles, _, _ = marching_cubes(inside.astype(np.float32), 0.5)
+        surface = trimesh.Trimesh(corners * voxel_m + line[0] + center, triangles, process=False)
+        found = meter.measure(hull)
+        assert found.lower_m > 0
+        theirs_m = peer.min_distance_single(surface)
+        assert abs(theirs_m - found.upper_m) <= np.sqrt(3) * voxel_m + 1e-4
+        assert theirs_m >= found.lower_m - voxel_m / 2  # no mesh vertex is farther from the hull
