@@ -1,21 +1,26 @@
 """Meshes kept for the next start: the same to the bit, or as if there were no cache at all."""
 
+import dataclasses
 import json
 import os
 import struct
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.sessions import CUBE, write_ball_session, write_cube_scene
+from helpers.step_files import step_box, step_cylinder, step_file
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
 from hybridve.hull.contact import mesh as mesh_module
-from hybridve.hull.contact.mesh import read_mesh
-from hybridve.hull.contact.mesh_cache import find_mesh, mesh_key
+from hybridve.hull.contact import readers as readers_module
+from hybridve.hull.contact.mesh import CadFile, read_cad
+from hybridve.hull.contact.mesh_cache import find_meshes, keep_meshes, mesh_key
+from hybridve.hull.contact.part import Contents
 
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1 / 3]])
 FACES = np.array([[0, 2, 1], [0, 1, 3]], np.int32)
@@ -35,8 +40,21 @@ def cube(tmp_path: Path) -> Path:
     return path
 
 
-def without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)  # importing it raises ImportError
+def without_readers(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("a file was read that is kept")
+
+    monkeypatch.setattr(mesh_module, "parse", refuse)
+
+
+def stl(path: Path) -> Path:
+    """Write the cube as binary STL."""
+    mesh = read_cad(path.parent / "cube.obj").parts[0]
+    record = np.zeros(len(mesh.faces), [("normal", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
+    record["v"] = mesh.vertices[mesh.faces]
+    head = b"\0" * 80 + np.uint32(len(record)).tobytes()
+    path.write_bytes(head + record.tobytes())
+    return path
 
 
 def glb(vertices: NDArray[np.float64], faces: NDArray[np.int32], **more: object) -> bytes:
@@ -72,104 +90,174 @@ def entries(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".off", ".glb", ".STL"])
-def test_a_mesh_is_read_once_and_then_comes_back_to_the_bit(
-    folder: Path, cube: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
-) -> None:
-    import open3d
-
-    path = tmp_path / f"part{suffix}"
-    if suffix == ".glb":  # Open3D writes none that it can read
+def written(suffix: str, cube: Path) -> Path:
+    """Write the cube as another kind of file, by another hand than ours."""
+    path = cube.with_name(f"part{suffix}")
+    if suffix.lower() in (".step", ".stp"):
+        path.write_text(step_file(step_box, "mm", (200.0, 200.0, 200.0)), encoding="utf-8")
+    elif suffix == ".glb":
         path.write_bytes(glb(VERTICES, FACES))
     else:
-        written = open3d.io.read_triangle_mesh(cube).compute_triangle_normals()
-        assert open3d.io.write_triangle_mesh(tmp_path / f"part{suffix.lower()}", written)
-        (tmp_path / f"part{suffix.lower()}").rename(path)
-    first = read_mesh(path)
+        import trimesh
 
-    without_open3d(monkeypatch)
-    again = read_mesh(path)
+        mesh = trimesh.load_mesh(cube, process=False)
+        content = mesh.export(file_type=suffix.lower()[1:])
+        files = content if isinstance(content, dict) else {path.name: content}
+        for name, data in files.items():  # a glTF is several
+            target = path if name == "model.gltf" else path.with_name(name)
+            target.write_bytes(data.encode() if isinstance(data, str) else data)
+    return path
+
+
+def assert_same(first: CadFile, again: CadFile) -> None:
+    for field in dataclasses.fields(CadFile):
+        if field.name != "parts":
+            assert getattr(first, field.name) == getattr(again, field.name)
+    for part, other in zip(first.parts, again.parts, strict=True):
+        assert part.vertices.tobytes() == other.vertices.tobytes()
+        assert part.faces.tobytes() == other.faces.tobytes()
+        assert (other.vertices.dtype, other.faces.dtype) == (np.float64, np.int32)
+        assert (part.name, part.material, part.rgba) == (other.name, other.material, other.rgba)
+
+
+@pytest.mark.parametrize(
+    "suffix", [".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".dae", ".step", ".STL"]
+)
+def test_a_file_is_read_once_and_then_comes_back_to_the_bit(
+    folder: Path, cube: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    path = written(suffix, cube)
+    first = read_cad(path)
+
+    without_readers(monkeypatch)
+    again = read_cad(path)
 
     assert len(entries(folder)) == 1
-    assert len(again.faces) == (2 if suffix == ".glb" else 12)
-    assert again.vertices.tobytes() == first.vertices.tobytes()
-    assert again.faces.tobytes() == first.faces.tobytes()
-    assert (again.vertices.dtype, again.faces.dtype) == (np.float64, np.int32)
+    assert len(again.parts[0].faces) == (2 if suffix == ".glb" else 12)
+    assert_same(first, again)
+
+
+def test_an_assembly_comes_back_to_the_bit(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "paint.mtl").write_text("newmtl red\nKd 0.1 0.2 0.3\n", encoding="utf-8")
+    path = tmp_path / "two.obj"
+    vertices, faces = (
+        "\n".join(line for line in CUBE.splitlines() if line.startswith(kind)) for kind in "vf"
+    )
+    path.write_text(
+        f"mtllib paint.mtl\n{vertices}\no one\nusemtl red\n{faces}\no two\nf 1 2 3\nf 1 2 4\n",
+        encoding="utf-8",
+    )
+    first = read_cad(path)
+
+    without_readers(monkeypatch)
+    again = read_cad(path)
+
+    assert [part.name for part in again.parts] == ["one", "two"]
+    assert again.parts[0].rgba == (0.1, 0.2, 0.3, 1.0)
+    assert [topology.closed for topology in again.topologies] == [True, False]
+    assert_same(first, again)
 
 
 def test_what_counts_is_the_content_and_neither_name_nor_time(
     folder: Path, cube: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read_mesh(cube)
+    read_cad(cube)
     before = cube.stat()
     moved = tmp_path / "moved.obj"
     moved.write_bytes(cube.read_bytes())
     cube.write_text(CUBE.replace("v 100 100 100", "v 100 100 107"), encoding="utf-8")
     os.utime(cube, ns=(before.st_atime_ns, before.st_mtime_ns))
 
-    changed = read_mesh(cube)
-    without_open3d(monkeypatch)
-    same = read_mesh(moved)
+    changed = read_cad(cube)
+    without_readers(monkeypatch)
+    same = read_cad(moved)
 
-    assert changed.vertices.max() == 107
-    assert same.vertices.max() == 100
+    assert changed.parts[0].vertices.max() == 107
+    assert same.parts[0].vertices.max() == 100
 
 
-def test_another_reader_another_kind_or_another_content_is_another_entry() -> None:
+def test_whatever_a_mesh_depends_on_makes_another_entry() -> None:
     keys = [
-        mesh_key(content, suffix, reader)
+        mesh_key(content, kind, reader, how, *beside)
         for content in (b"", b"a")
-        for suffix in (".stl", ".ply")
-        for reader in ("open3d 0.19.0", "open3d 0.20.0")
+        for kind in ("STL", "PLY")
+        for reader in ("trimesh 5.1.0", "trimesh 5.2.0")
+        for how in ("split", "merge")
+        for beside in ((), (b"",), (b"b",), (b"", b"b"))
     ]
 
-    assert len(set(keys)) == 8
+    assert len(set(keys)) == 64
 
 
-def test_another_open3d_reads_anew(
+def test_another_version_of_the_reader_reads_anew(
     folder: Path, cube: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read_mesh(cube)
-    monkeypatch.setattr(mesh_module, "version", lambda _: "999.0")
+    path = stl(cube.with_name("cube.stl"))
+    before = entries(folder)
+    read_cad(path)
+    monkeypatch.setattr(readers_module, "version", lambda _: "999.0")
 
-    read_mesh(cube)
+    read_cad(path)
 
-    assert len(entries(folder)) == 2
+    assert len(entries(folder)) == len(before) + 2
+
+
+def test_other_tolerances_and_other_splits_are_other_entries(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "rod.step"
+    path.write_text(step_file(step_cylinder, "mm", 50.0, 20.0), encoding="utf-8")
+
+    counts = [
+        len(read_cad(path, tessellation_m=tolerance_m, merge=merge).parts[0].faces)
+        for tolerance_m, merge in ((1e-3, False), (1e-4, False), (1e-4, True), (1e-3, False))
+    ]
+
+    assert counts[0] == counts[3] < counts[1] == counts[2]
+    assert len(entries(folder)) == 3
 
 
 @pytest.mark.parametrize(
-    ("vertices", "faces"),
+    ("name", "value"),
     [
-        (VERTICES[:, :2], FACES),
-        (VERTICES.astype(np.float32), FACES),
-        (VERTICES, FACES.astype(np.int64)),
-        (VERTICES, FACES[:, :2]),
-        (VERTICES[0], FACES),
+        ("vertices", VERTICES[:, :2]),
+        ("vertices", VERTICES.astype(np.float32)),
+        ("vertices", VERTICES[0]),
+        ("vertices", VERTICES[1:]),
+        ("faces", FACES.astype(np.int64)),
+        ("faces", FACES[:, :2]),
+        ("faces", FACES[1:]),
+        ("counts", np.array([4, 2])),
+        ("about", np.frombuffer(b"{", np.uint8)),
     ],
 )
 def test_an_archive_of_something_else_is_no_entry(
-    folder: Path, vertices: NDArray[np.generic], faces: NDArray[np.generic]
+    folder: Path, name: str, value: NDArray[np.generic]
 ) -> None:
-    key = mesh_key(b"", ".stl", "test")
-    folder.mkdir(parents=True)
-    np.savez(folder / f"{key}.npz", vertices=vertices, faces=faces)
+    key = mesh_key(b"", "STL", "test")
+    keep_meshes(key, [(VERTICES, FACES)], {"said": 1})
+    assert find_meshes(key) is not None
+    with np.load(folder / f"{key}.npz") as archive:
+        arrays = dict(archive)
 
-    assert find_mesh(key) is None
+    np.savez(folder / f"{key}.npz", **(arrays | {name: value}))
+
+    assert find_meshes(key) is None
 
 
 def test_a_damaged_entry_is_written_anew(
     folder: Path, cube: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = read_mesh(cube)
+    first = read_cad(cube)
     (name,) = entries(folder)
     (folder / name).write_bytes(b"\0" * 100)
 
-    read_mesh(cube)
-    without_open3d(monkeypatch)
-    again = read_mesh(cube)
+    read_cad(cube)
+    without_readers(monkeypatch)
+    again = read_cad(cube)
 
     assert entries(folder) == [name]
-    np.testing.assert_array_equal(again.vertices, first.vertices)
+    assert_same(first, again)
 
 
 @pytest.mark.parametrize("place", ["file/cache", "file", ""])
@@ -180,58 +268,75 @@ def test_where_nothing_can_be_kept_meshes_are_read_all_the_same(
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.setenv("HYBRIDVE_CACHE", str(tmp_path / place) if place else "off")
 
-    assert len(read_mesh(cube).faces) == 12
-    assert len(read_mesh(cube).faces) == 12
+    assert len(read_cad(cube).parts[0].faces) == 12
+    assert len(read_cad(cube).parts[0].faces) == 12
 
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_mesh_that_may_lean_on_another_file_is_not_kept(folder: Path, tmp_path: Path) -> None:
-    import open3d
+def test_the_files_that_a_mesh_leans_on_count_as_its_own(folder: Path, tmp_path: Path) -> None:
+    """The colours of an OBJ and the numbers of a glTF lie beside it."""
+    path = tmp_path / "part.obj"
+    path.write_text(f"mtllib part.mtl\nusemtl red\n{CUBE}", encoding="utf-8")
+    colours = []
+    for text in (None, "newmtl red\nKd 1 0 0\n", "newmtl red\nKd 0 1 0\nd 0.5\n"):
+        if text is not None:
+            (tmp_path / "part.mtl").write_text(text, encoding="utf-8")
+        colours.append(read_cad(path).parts[0].rgba)
+    assert colours == [None, (1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.5)]
 
-    written = open3d.geometry.TriangleMesh.create_box()
-    open3d.io.write_triangle_mesh(tmp_path / "part.gltf", written)
-    (tmp_path / "part.glb").write_bytes(glb(VERTICES, FACES, images=[{"uri": "paint.png"}]))
-    (tmp_path / "part.obj").write_text(f"mtllib part.mtl\n{CUBE}", encoding="utf-8")
+    whole = glb(VERTICES, FACES)
+    (json_length,) = struct.unpack_from("<I", whole, 12)
+    document = json.loads(whole[20 : 20 + json_length])
+    document["buffers"][0]["uri"] = "some%20numbers.bin"
+    numbers = whole[28 + json_length :]
+    path = tmp_path / "part.gltf"
+    path.write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(SceneError, match=r"keeps its numbers in some numbers\.bin"):
+        read_cad(path)
+    largest = []
+    for content in (numbers, numbers.replace(np.float32(1).tobytes(), np.float32(7).tobytes())):
+        (tmp_path / "some numbers.bin").write_bytes(content)
+        cad = read_cad(path)
+        largest.append(cad.parts[0].vertices.max())
+        assert cad.beside == (tmp_path / "some numbers.bin",)
+    assert largest == [1, 7]
+    assert len(entries(folder)) == 5
 
-    counts = [len(read_mesh(tmp_path / f"part.{kind}").faces) for kind in ("gltf", "glb", "obj")]
 
-    assert counts == [12, 2, 12]
-    assert entries(folder) == []
-
-
-def test_materials_change_the_order_of_an_objs_triangles(folder: Path, tmp_path: Path) -> None:
-    """Why an OBJ that names materials is read anew: its triangles' numbers stand in the report."""
+def test_materials_leave_the_triangles_in_their_order(folder: Path, tmp_path: Path) -> None:
+    """Their numbers stand in the report."""
     vertices, faces = (
         [line for line in CUBE.splitlines() if line.startswith(kind)] for kind in "vf"
     )
     coloured = [f"usemtl {('blue', 'red')[n % 2]}\n{face}" for n, face in enumerate(faces)]
     path = tmp_path / "part.obj"
     path.write_text("\n".join(["mtllib part.mtl", *vertices, *coloured]), encoding="utf-8")
-    orders = []
-    for materials in ("newmtl red\nnewmtl blue\nKd 0 0 1\n", "newmtl blue\nKd 1 0 0\nnewmtl red\n"):
-        (tmp_path / "part.mtl").write_text(materials, encoding="utf-8")
-        mesh = read_mesh(path)
-        orders.append(mesh.vertices[mesh.faces].round(6).tolist())
+    (tmp_path / "part.mtl").write_text("newmtl red\nnewmtl blue\nKd 0 0 1\n", encoding="utf-8")
 
-    assert orders[0] != orders[1]
-    assert sorted(map(sorted, orders[0])) == sorted(map(sorted, orders[1]))
+    part = read_cad(path).parts[0]
+
+    expected = [[int(word) - 1 for word in face.split()[1:]] for face in faces]
+    assert part.faces.tolist() == expected
+    assert (part.material, part.rgba) == ("", None)  # there are two
 
 
-def test_a_file_that_changes_while_it_is_read_is_not_kept(
+def test_what_is_kept_is_what_was_read_though_the_file_changes_meanwhile(
     folder: Path, cube: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read = mesh_module._read_with_open3d
+    parse = mesh_module.parse
 
-    def write_then_read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    def write_then_parse(content: bytes, kind: str, path: Path, *rest: Any) -> Contents:
         path.write_text(CUBE.replace("v 100 100 100", "v 100 100 107"), encoding="utf-8")
-        return read(path)
+        return parse(content, kind, path, *rest)
 
-    monkeypatch.setattr(mesh_module, "_read_with_open3d", write_then_read)
+    with monkeypatch.context() as patch:
+        patch.setattr(mesh_module, "parse", write_then_parse)
+        assert read_cad(cube).parts[0].vertices.max() == 100
 
-    read_mesh(cube)
-
-    assert entries(folder) == []
+    assert read_cad(cube).parts[0].vertices.max() == 107
+    cube.write_text(CUBE, encoding="utf-8")
+    assert read_cad(cube).parts[0].vertices.max() == 100
 
 
 def test_a_mesh_that_is_refused_is_not_kept(folder: Path, tmp_path: Path) -> None:
@@ -240,18 +345,20 @@ def test_a_mesh_that_is_refused_is_not_kept(folder: Path, tmp_path: Path) -> Non
 
     for _ in range(2):
         with pytest.raises(SceneError, match="the mesh is empty"):
-            read_mesh(path)
+            read_cad(path)
 
     assert entries(folder) == []
 
 
-def test_a_second_detect_does_without_open3d(folder: Path, tmp_path: Path) -> None:
+def test_a_second_detect_does_without_the_readers(folder: Path, tmp_path: Path) -> None:
     session = write_ball_session(tmp_path, np.zeros((1, 3)))
     scene = write_cube_scene(tmp_path, {"part": (0.0, 0.0, 150.0)})
+    stl(tmp_path / "cube.stl")
+    scene.write_text(scene.read_text("utf-8").replace("cube.obj", "cube.stl"), encoding="utf-8")
     code = (
         "import sys\nfrom hybridve.cli.main import main\n"
         "try:\n    main()\nexcept SystemExit as left:\n    assert left.code == 0\n"
-        "print('open3d' in sys.modules)"
+        "print('trimesh' in sys.modules)"
     )
 
     arguments = ["detect", session, "--scene", scene, "-o", tmp_path / "report.h5", "--overwrite"]

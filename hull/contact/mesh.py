@@ -1,51 +1,94 @@
 """CAD meshes as they come from files: read, checked, never silently repaired."""
 
 import logging
-from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
-from hybridve.hull.contact.mesh_cache import find_mesh, keep_mesh, mesh_key
+from hybridve.hull.contact.mesh_cache import find_meshes, keep_meshes, mesh_key
+from hybridve.hull.contact.part import Contents, Part, Up, join_parts
+from hybridve.hull.contact.readers import FORMATS, TESSELLATED, leans_on, parse, reader_version
+from hybridve.hull.contact.topology import Topology, examine_topology
 
 _log = logging.getLogger(__name__)
 
-#: What Open3D reads.
-MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".fbx")
-
-#: Kinds of files whose mesh is all their own, so that the same content is always the same mesh, and
-#: by which word those give themselves away that lean on other files all the same. Materials in a
-#: file beside an OBJ change the order of its triangles; a GLB may keep its vertices elsewhere. A
-#: glTF does so as a rule, and what an FBX leans on is not known here.
-_SELF_CONTAINED = {".stl": None, ".ply": None, ".off": None, ".obj": b"mtllib", ".glb": b'"uri"'}
+#: How far triangles may be from the surface of a STEP file, unless the scene says otherwise.
+TESSELLATION_M = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mesh:
-    """A triangle mesh in the frame and unit of its file.
+class CadFile:
+    """A CAD file, read and checked.
 
     Attributes
     ----------
-    vertices : (V, 3) float64
-        In the unit of the file.
-    faces : (T, 3) int32
-        Vertex numbers.
-    n_zero_area : int
-        How many triangles have no area. They are kept: their edges are still sampled.
+    path : Path
+        Where it lies.
+    beside : tuple of Path
+        The files that it leans on, as far as they are there.
+    kind : str
+        Such as ``STL``.
+    parts : tuple of Part
+        At least one, each with at least one triangle, in the file's order, unit and axes.
+    topologies : tuple of Topology
+        What the edges of each part say.
+    unit : str
+        What the file says its unit is; empty if its kind does not say.
+    unit_m : float or None
+        That unit in metres; None if the file does not say.
+    up : {"x", "y", "z"}
+        The axis that points up by the file, or by the standard of its kind.
+    tessellation_m : float or None
+        How far the triangles may be from the surface they stand for; None if the file is made of
+        triangles.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    n_zero_area: int
+    path: Path
+    beside: tuple[Path, ...]
+    kind: str
+    parts: tuple[Part, ...]
+    topologies: tuple[Topology, ...]
+    unit: str
+    unit_m: float | None
+    up: Up
+    tessellation_m: float | None
 
 
-def read_mesh(path: Path) -> Mesh:
-    """Return the mesh in a file.
+def kind_of(path: Path) -> str:
+    """Return what kind of CAD a file is, by its suffix.
 
-    A mesh that was read before comes from `hybridve.hull.contact.mesh_cache`, the same to the bit.
+    Raises
+    ------
+    SceneError
+        If there is no such file, or its kind is unknown.
+    """
+    if not path.is_file():
+        raise SceneError(f"there is no mesh file {path}")
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        kinds = ", ".join(FORMATS)
+        raise SceneError(
+            f"{path}: a {path.suffix or 'file without suffix'} cannot be read; {kinds} can"
+        )
+    return kind
+
+
+def read_cad(path: Path, *, merge: bool = False, tessellation_m: float = TESSELLATION_M) -> CadFile:
+    """Return the parts in a file.
+
+    What was read before comes from `hybridve.hull.contact.mesh_cache`, the same to the bit.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    merge : bool
+        Take the whole file for one part.
+    tessellation_m : float
+        How far triangles may be from the surface of a STEP file; nothing to others.
 
     Raises
     ------
@@ -53,65 +96,130 @@ def read_mesh(path: Path) -> Mesh:
         If there is no such file, it cannot be read, its kind is unknown, or it holds no triangle or
         a coordinate that is not a finite number.
     """
-    if not path.is_file():
-        raise SceneError(f"there is no mesh file {path}")
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        kinds = ", ".join(MESH_SUFFIXES)
-        raise SceneError(
-            f"{path}: a {path.suffix or 'file without suffix'} cannot be read; {kinds} can"
-        )
-    key = _cache_key(path)
-    kept = None if key is None else find_mesh(key)
-    if kept is not None:
-        return check_mesh(*kept, str(path))
-    vertices, faces = _read_with_open3d(path)
-    mesh = check_mesh(vertices, faces, str(path))
-    # Asked again: a file that was written to meanwhile must not be kept as what it was before.
-    if key is not None and key == _cache_key(path):
-        keep_mesh(key, mesh.vertices, mesh.faces)
-    return mesh
-
-
-def _read_with_open3d(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    import open3d  # late: the import alone takes up to a second
-
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        loaded = open3d.io.read_triangle_mesh(path)
-    vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-    faces = np.array(loaded.triangles, dtype=np.int32).reshape(-1, 3)
-    if len(faces) == 0:
-        raise SceneError(f"{path}: the mesh is empty: no triangle was found in it; export it again")
-    return vertices, faces
-
-
-def _cache_key(path: Path) -> str | None:
-    """Return the name under which a file's mesh is kept; None if it may depend on other files."""
-    suffix = path.suffix.lower()
-    reader = _open3d_version()
-    if suffix not in _SELF_CONTAINED or reader is None:
-        return None
+    kind = kind_of(path)
+    content = _read_bytes(path)
     try:
-        content = path.read_bytes()
+        names = leans_on(content, kind)
+    except ValueError as error:
+        raise SceneError(f"{path}: the file cannot be read: {error}") from error
+    beside = {
+        name: _read_bytes(path.parent / name) for name in names if (path.parent / name).is_file()
+    }
+    how = f"{tessellation_m if kind in TESSELLATED else None} {'merge' if merge else 'split'}"
+    reader = reader_version(kind)
+    key = None
+    if reader is not None:
+        stamped = (f"{name} {name in beside} ".encode() + beside.get(name, b"") for name in names)
+        key = mesh_key(content, kind, reader, how, *stamped)
+    found = None if key is None else _find(key)
+    if found is None:
+        contents = _parse(content, kind, path, beside, tessellation_m)
+        parts = (join_parts(contents.parts),) if merge else contents.parts
+        for part in parts:
+            label = f"{path}: part {part.name!r}" if len(parts) > 1 else str(path)
+            check_mesh(part.vertices, part.faces, label)
+        topologies = tuple(examine_topology(part.vertices, part.faces) for part in parts)
+        contents = Contents(parts, contents.unit, contents.unit_m, contents.up)
+        if key is not None:
+            _keep(key, contents, topologies)
+    else:
+        contents, topologies = found
+    for part, topology in zip(contents.parts, topologies, strict=True):
+        _log_flaws(path, part, topology)
+    return CadFile(
+        path=path,
+        beside=tuple(path.parent / name for name in beside),
+        kind=kind,
+        parts=contents.parts,
+        topologies=topologies,
+        unit=contents.unit,
+        unit_m=contents.unit_m,
+        up=contents.up,
+        tessellation_m=tessellation_m if kind in TESSELLATED else None,
+    )
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
     except OSError as error:
         raise SceneError(f"{path}: the file cannot be read: {error.strerror}") from error
-    elsewhere = _SELF_CONTAINED[suffix]
-    if elsewhere is not None and elsewhere in content:
+
+
+def _parse(
+    content: bytes, kind: str, path: Path, beside: dict[str, bytes], tessellation_m: float
+) -> Contents:
+    try:
+        contents = parse(content, kind, path, beside, tessellation_m)
+    except ValueError as error:
+        raise SceneError(f"{path}: the file cannot be read: {error}") from error
+    except ImportError as error:
+        raise SceneError(
+            f"{path}: {kind} cannot be read without the package {error.name}; install it"
+        ) from error
+    if not any(len(part.faces) for part in contents.parts):
+        raise SceneError(f"{path}: the mesh is empty: no triangle was found in it; export it again")
+    return contents
+
+
+def _find(key: str) -> tuple[Contents, tuple[Topology, ...]] | None:
+    found = find_meshes(key)
+    if found is None:
         return None
-    return mesh_key(content, suffix, reader)
+    meshes, about = found
+    parts = tuple(
+        Part(
+            said["name"],
+            vertices,
+            faces,
+            said["material"],
+            None if said["rgba"] is None else tuple(said["rgba"]),
+        )
+        for (vertices, faces), said in zip(meshes, about["parts"], strict=True)
+    )
+    topologies = tuple(Topology(**said["topology"]) for said in about["parts"])
+    return Contents(parts, about["unit"], about["unit_m"], about["up"]), topologies
 
 
-def _open3d_version() -> str | None:
-    """Return the version of Open3D, without importing it."""
-    for package in ("open3d-cpu", "open3d"):  # the same library under two names
-        try:
-            return f"{package} {version(package)}"
-        except PackageNotFoundError:
-            continue
-    return None
+def _keep(key: str, contents: Contents, topologies: tuple[Topology, ...]) -> None:
+    about = {
+        "unit": contents.unit,
+        "unit_m": contents.unit_m,
+        "up": contents.up,
+        "parts": [
+            {
+                "name": part.name,
+                "material": part.material,
+                "rgba": part.rgba,
+                "topology": asdict(topology),
+            }
+            for part, topology in zip(contents.parts, topologies, strict=True)
+        ],
+    }
+    keep_meshes(key, [(part.vertices, part.faces) for part in contents.parts], about)
 
 
-def check_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int32], label: str) -> Mesh:
-    """Return a mesh after a look at its numbers.
+def _log_flaws(path: Path, part: Part, topology: Topology) -> None:
+    label = f"{path}: part {part.name!r}" if part.name else str(path)
+    if topology.n_zero_area:
+        _log.info(
+            "%s: %d of %d triangles have no area", label, topology.n_zero_area, len(part.faces)
+        )
+    if not topology.closed:
+        _log.info(
+            "%s: not closed: %d open edges, %d that more than two triangles use, %d whose two "
+            "triangles disagree on the outside",
+            label,
+            topology.n_open_edges,
+            topology.n_nonmanifold_edges,
+            topology.n_inconsistent_edges,
+        )
+    elif topology.volume is not None and topology.volume < 0:
+        _log.info("%s: closed, but inside out", label)
+
+
+def check_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int32], label: str) -> None:
+    """Look at a mesh's numbers.
 
     Raises
     ------
@@ -128,9 +236,3 @@ def check_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int32], label: s
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SceneError(f"{label}: a face names a vertex that is not there; export it again")
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    doubled_areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    n_zero_area = int((doubled_areas == 0).sum())
-    if n_zero_area:
-        _log.info("%s: %d of %d triangles have no area", label, n_zero_area, len(faces))
-    return Mesh(vertices, faces, n_zero_area)

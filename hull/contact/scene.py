@@ -1,7 +1,20 @@
-"""The CAD scene: scene.toml, checked, its meshes placed in the world."""
+"""The CAD scene: scene.toml, checked, its meshes placed in the world.
+
+A file becomes an object. A file of several parts becomes as many objects, called ``OBJECT.PART``
+after the names in the file; all keys of its table hold for each of them. In a part's name, ``/``
+and blanks become ``_``; a part without a name is ``part``; parts of the same name become ``bolt``,
+``bolt.2``, ``bolt.3`` in the file's order. ``parts = "merge"`` keeps the file as one object.
+
+A file is turned so that what is up in it is up in the world, before anything else is done: glTF is
+y up by its standard, COLLADA says, all others are taken as z up, and ``up`` overrides any of them.
+STEP, glTF and COLLADA bring their unit (glTF is metres by its standard); for all others the scene
+must give it. For glTF and COLLADA it may, against what the file says; for STEP it may not.
+"""
 
 import hashlib
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,11 +24,21 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from hybridve.calib.errors import SceneError
 from hybridve.calib.pose import rotation_about_axes
-from hybridve.hull.contact.mesh import read_mesh
+from hybridve.hull.contact.mesh import TESSELLATION_M, CadFile, kind_of, read_cad
+from hybridve.hull.contact.part import Part, Up
+from hybridve.hull.contact.readers import FORMATS, TESSELLATED, WITH_UNIT
+from hybridve.hull.contact.topology import Topology
 from hybridve.hull.toml_io import expand_root, explain_validation, read_toml
 
 #: How many metres one unit of a mesh file is.
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+
+#: Where the axes of a mesh that is z up lie in one that is not, and with which sign. Seen from the
+#: front, COLLADA's conventions: right is x, x, -y; up is z, y, x; towards the viewer is -y, z, z.
+_FROM_UP: dict[Up, tuple[tuple[int, int, int], tuple[float, float, float]]] = {
+    "y": ((0, 2, 1), (1.0, -1.0, 1.0)),
+    "x": ((1, 2, 0), (-1.0, -1.0, 1.0)),
+}
 
 _Vector = tuple[float, float, float]
 
@@ -28,7 +51,11 @@ class _ObjectTable(_Table):
     # The name becomes a group of the report, where "/" separates and "." stands for the group.
     name: Annotated[str, Field(pattern=r"^[^/\s.][^/\s]*$")]
     mesh: str
-    unit: Literal["m", "cm", "mm", "in", "ft"]
+    unit: Literal["m", "cm", "mm", "in", "ft"] | None = None
+    up: Up | None = None
+    parts: Literal["split", "merge"] = "split"
+    # Less than a micrometre is more than single precision holds; more than a metre, no part.
+    tessellation_mm: Annotated[float, Field(ge=0.001, le=1000.0)] | None = None
     translate_mm: _Vector = (0.0, 0.0, 0.0)
     rotate_deg: _Vector = (0.0, 0.0, 0.0)
     required_clearance_mm: Annotated[float, Field(ge=0)] = 0.0
@@ -41,6 +68,10 @@ class _ObjectTable(_Table):
         if direction is not None and not any(direction):
             raise ValueError("[0, 0, 0] points nowhere; give a direction")
         return direction
+
+
+class _KeyError(Exception):
+    """A key of the scene is at fault, not its mesh; the text is complete."""
 
 
 class _EffectTable(BaseModel):
@@ -77,7 +108,13 @@ class SceneObject:
         The paper's RP_obj; the centre of the bounding box unless the scene says otherwise.
     recovery_direction : (3,) float64 or None
         Unit vector of a constrained object's V_rec, world; the scene gives it, as it gives the
-        reference point, in the frame of the mesh.
+        reference point, in the frame of the mesh, after that was turned z up.
+    is_closed : bool
+        Whether the surface closes off a volume, so that inside and outside can be told apart.
+    color : tuple of 4 floats, or None
+        What the file says of its colour, 0 to 1, as a picture shows it (sRGB), and its opacity.
+    about : dict
+        What the report says of where it came from, as plain JSON values; see `load_scene`.
     """
 
     name: str
@@ -87,6 +124,9 @@ class SceneObject:
     required_clearance_m: float
     reference_point_world: NDArray[np.float64]
     recovery_direction: NDArray[np.float64] | None
+    is_closed: bool = False
+    color: tuple[float, float, float, float] | None = None
+    about: dict[str, Any] = field(default_factory=dict)
 
     @property
     def box_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -108,7 +148,7 @@ class Scene:
     effects : tuple of dict
         The ``[[effect]]`` tables as they stand.
     checksum : str
-        SHA-256 over the scene.toml and the meshes it names.
+        SHA-256 over the scene.toml, the meshes it names, and the files that these lean on.
     """
 
     path: Path
@@ -120,8 +160,18 @@ class Scene:
 def load_scene(path: Path) -> Scene:
     """Return the scene that a scene.toml describes, its meshes in metres in the world.
 
-    An object's file is scaled by its unit, turned by `rotate_deg` about x, then y, then z of the
-    world, and moved by `translate_mm`.
+    An object's file is turned z up, scaled by its unit, turned by `rotate_deg` about x, then y,
+    then z of the world, and moved by `translate_mm`.
+
+    Each object's `about` holds: ``mesh`` (as the scene names it), ``format``, ``part`` (the name in
+    the file; None for a file of one part, or merged), ``unit`` (as the scene or the file names it),
+    ``unit_m`` (metres), ``up`` (the axis that was turned up), ``tessellation_m`` (largest distance
+    of a triangle from the surface it stands for; None if the file is made of triangles),
+    ``n_triangles``, ``n_vertices``, ``n_zero_area``, ``n_open_edges``, ``n_nonmanifold_edges``,
+    ``n_inconsistent_edges``, ``closed``, ``closed_within_m`` (0, or the noise of single precision),
+    ``volume_m3`` and ``inside_out`` (these three None if not closed), and ``material`` (``name``
+    and ``rgba``, either None). How edges are counted, and what closed means, is told in
+    `hybridve.hull.contact.topology`; nothing is repaired.
 
     Raises
     ------
@@ -134,60 +184,165 @@ def load_scene(path: Path) -> Scene:
         parsed = _SceneTable.model_validate(table)
     except ValidationError as error:
         raise SceneError(explain_validation(error, path)) from None
-    names = [entry.name for entry in parsed.object]
-    for number, name in enumerate(names):
-        if name in names[:number]:
+    for number, entry in enumerate(parsed.object, start=1):
+        before = [earlier.name for earlier in parsed.object[: number - 1]]
+        if entry.name in before:
             raise SceneError(
-                f"{path}: object.{number + 1}.name: {name!r} is the name of object."
-                f"{names.index(name) + 1} too; give each object its own"
+                f"{path}: object.{number}.name: {entry.name!r} is the name of object."
+                f"{before.index(entry.name) + 1} too; give each object its own"
             )
     root = expand_root(parsed.root, path, SceneError)
     checksum = hashlib.sha256(text)
-    objects = []
+    objects: dict[str, SceneObject] = {}
     for number, entry in enumerate(parsed.object, start=1):
+        label = f"{path}: object.{number}"
         try:
-            objects.append(_place(entry, root))
+            kind = kind_of(root / entry.mesh)
+            _refuse_what_the_kind_has(entry, kind, label)
+            tessellation_m = TESSELLATION_M
+            if entry.tessellation_mm is not None:
+                tessellation_m = entry.tessellation_mm / 1000.0
+            cad = read_cad(
+                root / entry.mesh, merge=entry.parts == "merge", tessellation_m=tessellation_m
+            )
+        except _KeyError as error:
+            raise SceneError(str(error)) from None
         except SceneError as error:
-            raise SceneError(f"{path}: object.{number}.mesh: {error}") from error
-        checksum.update((root / entry.mesh).read_bytes())
+            raise SceneError(f"{label}.mesh: {error}") from error
+        for placed in _place(entry, cad):
+            if placed.name in objects:
+                raise SceneError(
+                    f"{label}.name: this object or a part of it would be called {placed.name!r}, "
+                    "as another is already; give it another name"
+                )
+            objects[placed.name] = placed
+        for file in (cad.path, *cad.beside):
+            checksum.update(file.read_bytes())
     return Scene(
         path=path,
-        objects=tuple(objects),
+        objects=tuple(objects.values()),
         effects=tuple(entry.model_dump() for entry in parsed.effect),
         checksum=checksum.hexdigest(),
     )
 
 
 def _refuse_missing_units(table: dict[str, Any], path: Path) -> None:
-    for number, entry in enumerate(table.get("object", []), start=1):
-        if isinstance(entry, dict) and "unit" not in entry:
+    entries = table.get("object", [])
+    for number, entry in enumerate(entries if isinstance(entries, list) else [], start=1):
+        if not isinstance(entry, dict) or "unit" in entry:
+            continue
+        kind = FORMATS.get(Path(str(entry.get("mesh", ""))).suffix.lower())
+        if kind not in WITH_UNIT:
             raise SceneError(
-                f"{path}: object.{number}.unit: this key is missing; mesh files do not say their "
-                f"unit, and it is never guessed: one of {', '.join(UNITS_M)}"
+                f"{path}: object.{number}.unit: this key is missing; {kind or 'mesh'} files do not "
+                f"say their unit, and it is never guessed: one of {', '.join(UNITS_M)}"
             )
 
 
-def _place(entry: _ObjectTable, root: Path) -> SceneObject:
-    mesh_path = root / entry.mesh
-    mesh = read_mesh(mesh_path)
+def _refuse_what_the_kind_has(entry: _ObjectTable, kind: str, label: str) -> None:
+    """Refuse keys that have no meaning for a kind of file."""
+    if kind in TESSELLATED and entry.unit is not None:
+        raise _KeyError(
+            f"{label}.unit: found {entry.unit!r}, but a {kind} file brings its own unit; "
+            "remove this key"
+        )
+    if kind not in TESSELLATED and entry.tessellation_mm is not None:
+        raise _KeyError(
+            f"{label}.tessellation_mm: found {entry.tessellation_mm:g}, but {kind} is made of "
+            "triangles already, only STEP becomes triangles here; remove this key"
+        )
+
+
+def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
+    """Yield the objects that a file becomes."""
+    up = entry.up or cad.up
+    unit_m = UNITS_M[entry.unit] if entry.unit is not None else cad.unit_m
+    if unit_m is None:
+        raise ValueError(f"{entry.name}: neither the scene nor the file gives a unit")
     rotation = rotation_about_axes(entry.rotate_deg)
     translation_m = np.array(entry.translate_mm) / 1000.0
-    vertices_world = (mesh.vertices * UNITS_M[entry.unit]) @ rotation.T + translation_m
-    if entry.reference_point_mm is not None:
-        reference_point_m = rotation @ (np.array(entry.reference_point_mm) / 1000.0) + translation_m
-    else:
-        used = vertices_world[mesh.faces.ravel()]
-        reference_point_m = (used.min(axis=0) + used.max(axis=0)) / 2.0
     direction = None
     if entry.recovery_direction is not None:
         direction = rotation @ np.array(entry.recovery_direction)
         direction /= np.linalg.norm(direction)
-    return SceneObject(
-        name=entry.name,
-        mesh_path=mesh_path,
-        vertices_world=vertices_world,
-        faces=mesh.faces,
-        required_clearance_m=entry.required_clearance_mm / 1000.0,
-        reference_point_world=reference_point_m,
-        recovery_direction=direction,
-    )
+    is_assembly = len(cad.parts) > 1
+    names = part_names([part.name for part in cad.parts])
+    for part, topology, name in zip(cad.parts, cad.topologies, names, strict=True):
+        vertices = part.vertices
+        if up != "z":
+            columns, signs = _FROM_UP[up]
+            vertices = vertices[:, columns] * signs
+        vertices_world = (vertices * unit_m) @ rotation.T + translation_m
+        if entry.reference_point_mm is not None:
+            reference_point_world = (
+                rotation @ (np.array(entry.reference_point_mm) / 1000.0) + translation_m
+            )
+        else:
+            used = vertices_world[part.faces.ravel()]
+            reference_point_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
+        about = {
+            "mesh": entry.mesh,
+            "format": cad.kind,
+            "part": name if is_assembly else None,
+            "unit": entry.unit or cad.unit,
+            "unit_m": unit_m,
+            "up": up,
+            "tessellation_m": cad.tessellation_m,
+        }
+        yield SceneObject(
+            name=f"{entry.name}.{name}" if is_assembly else entry.name,
+            mesh_path=cad.path,
+            vertices_world=vertices_world,
+            faces=part.faces,
+            required_clearance_m=entry.required_clearance_mm / 1000.0,
+            reference_point_world=reference_point_world,
+            recovery_direction=direction,
+            is_closed=topology.closed,
+            color=part.rgba,
+            about=about | _about_mesh(part, topology, unit_m),
+        )
+
+
+def _about_mesh(part: Part, topology: Topology, unit_m: float) -> dict[str, Any]:
+    volume = topology.volume
+    return {
+        "n_triangles": len(part.faces),
+        "n_vertices": len(part.vertices),
+        "n_zero_area": topology.n_zero_area,
+        "n_open_edges": topology.n_open_edges,
+        "n_nonmanifold_edges": topology.n_nonmanifold_edges,
+        "n_inconsistent_edges": topology.n_inconsistent_edges,
+        "closed": topology.closed,
+        "closed_within_m": (
+            None if topology.closed_within is None else topology.closed_within * unit_m
+        ),
+        "volume_m3": None if volume is None else abs(volume) * unit_m**3,
+        "inside_out": None if volume is None else volume < 0,
+        "material": {
+            "name": part.material or None,
+            "rgba": None if part.rgba is None else list(part.rgba),
+        },
+    }
+
+
+def part_names(names: list[str]) -> list[str]:
+    """Return what parts are called that a file calls so: fit for a report, and all different.
+
+    Examples
+    --------
+    >>> part_names(["bolt", "left plate", "bolt", "", "a/b"])
+    ['bolt', 'left_plate', 'bolt.2', 'part', 'a_b']
+    """
+    fit = [re.sub(r"[/\s\x00-\x1f\x7f]+", "_", name.strip()) or "part" for name in names]
+    # A name that stands in the file goes to the part that has it, not to the second of another.
+    taken: set[str] = set()
+    result = []
+    for number, name in enumerate(fit):
+        given = name
+        count = 1
+        while given in taken or (count > 1 and given in fit[number + 1 :]):
+            count += 1
+            given = f"{name}.{count}"
+        taken.add(given)
+        result.append(given)
+    return result

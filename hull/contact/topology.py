@@ -1,0 +1,156 @@
+"""What the edges of a mesh say: whether it closes off a volume, and where it does not.
+
+Files repeat a vertex for every face that uses it (STL) or for every normal (glTF, STEP), so edges
+are compared between vertices of equal coordinates, in the numbers of the file. An edge is fine when
+exactly two triangles use it, in opposite directions. A mesh is closed when all its edges are; then
+inside and outside can be told apart everywhere. The rule is strict: two cubes that share an edge,
+or a solid that is there twice, are not closed, because counting their surfaces along a ray gives an
+answer that depends on who counts. The mesh itself is never touched.
+
+Two things that files are full of do not count against a mesh.
+
+*Triangles without area* add nothing to the surface. One with two corners at the same place uses one
+edge there and back; it is never looked at. One with three corners on a line may be all that joins a
+long edge to the two halves on its other side; dropped, it would leave three open edges where there
+is no gap. So a mesh is closed if it is with these, or if it is without.
+
+*Noise in the last bit* of single precision, such as 1e-16 in one face and 0 in the next: four of 26
+real STL files are closed but for that. If a mesh is not closed as it stands, it is looked at once
+more with coordinates taken as equal that differ by no more than two units in the last place of the
+largest, as single precision counts. If it is closed then, `closed_within` says how much was
+allowed; the edges are counted as the file has them all the same.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Topology:
+    """What is to be known of a mesh before anything is said about its inside.
+
+    Attributes
+    ----------
+    n_zero_area : int
+        How many triangles have no area.
+    n_open_edges, n_nonmanifold_edges, n_inconsistent_edges : int
+        Edges that one triangle uses; that three or more use; that two use in the same direction.
+    closed_within : float or None
+        How far apart coordinates may be, in the unit of the mesh, for vertices to be at one place
+        and the mesh to be closed: 0, or the noise of single precision. None if it is not closed.
+    volume : float or None
+        What a closed mesh encloses, in cubes of its unit; negative if it is inside out. None if it
+        is not closed.
+    """
+
+    n_zero_area: int
+    n_open_edges: int
+    n_nonmanifold_edges: int
+    n_inconsistent_edges: int
+    closed_within: float | None
+    volume: float | None
+
+    @property
+    def closed(self) -> bool:
+        """Whether inside and outside can be told apart."""
+        return self.closed_within is not None
+
+
+def examine_topology(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> Topology:
+    """Return what the edges of a mesh say.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64
+        Finite.
+    faces : (T, 3) int32
+        Vertex numbers, counter-clockwise seen from outside.
+    """
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    has_area = np.linalg.norm(np.cross(b - a, c - a), axis=1) != 0
+    places = _places(vertices, 0.0)[faces]  # (T, 3)
+    counts = _bad_edges(places, has_area)
+    closed_within = None
+    if has_area.any():
+        if not any(counts):
+            closed_within = 0.0
+        else:
+            noise = float(np.abs(vertices[faces]).max()) * 2.0**-22
+            places = _places(vertices, noise)[faces]
+            # No triangle may be lost: what is as fine as the noise cannot be told from a crack.
+            if _has_three_corners(places)[has_area].all() and not any(_bad_edges(places, has_area)):
+                closed_within = noise
+    return Topology(
+        n_zero_area=int((~has_area).sum()),
+        n_open_edges=counts[0],
+        n_nonmanifold_edges=counts[1],
+        n_inconsistent_edges=counts[2],
+        closed_within=closed_within,
+        volume=None if closed_within is None else _volume(a, b, c),
+    )
+
+
+def _places(vertices: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
+    """Return a number for each vertex (V,): the same for coordinates that are at most so far apart.
+
+    Or that are joined by others between them, each no farther from the next.
+    """
+    columns = np.zeros(vertices.shape, np.int64)
+    for axis in range(3):
+        order = np.argsort(vertices[:, axis])
+        is_new = np.diff(vertices[order, axis]) > apart
+        columns[order[1:], axis] = np.cumsum(is_new)
+    order = np.lexsort(columns.T)
+    is_new = (columns[order[1:]] != columns[order[:-1]]).any(axis=1)
+    places = np.zeros(len(vertices), np.int64)
+    places[order[1:]] = np.cumsum(is_new)
+    return places
+
+
+def _has_three_corners(places: NDArray[np.int64]) -> NDArray[np.bool_]:
+    first, second, third = places.T
+    result: NDArray[np.bool_] = (first != second) & (second != third) & (third != first)
+    return result
+
+
+def _bad_edges(places: NDArray[np.int64], has_area: NDArray[np.bool_]) -> tuple[int, int, int]:
+    """Return how many edges are open, non-manifold and inconsistent.
+
+    Of triangles (T, 3) with three corners; or, if there is none among those with area, of these.
+    """
+    has_three_corners = _has_three_corners(places)
+    counts = _count_edges(places[has_three_corners])
+    if any(counts) and (has_three_corners & ~has_area).any():
+        without = _count_edges(places[has_three_corners & has_area])
+        if not any(without):
+            return without
+    return counts
+
+
+def _count_edges(places: NDArray[np.int64]) -> tuple[int, int, int]:
+    """Return how many edges of triangles (T, 3) are open, non-manifold and inconsistent."""
+    tails = places.ravel()
+    heads = np.roll(places, -1, axis=1).ravel()
+    is_forward = tails < heads
+    lower, upper = np.where(is_forward, (tails, heads), (heads, tails))
+    edges = lower * (places.max(initial=0) + 1) + upper
+    order = np.argsort(edges)
+    starts = np.flatnonzero(np.diff(edges[order], prepend=-1))
+    n_uses = np.diff(starts, append=len(edges))
+    forward_before = np.concatenate([[0], np.cumsum(is_forward[order])])
+    n_forward = np.diff(forward_before[np.append(starts, len(edges))])
+    return (
+        int((n_uses == 1).sum()),
+        int((n_uses > 2).sum()),
+        int(((n_uses == 2) & (n_forward != 1)).sum()),
+    )
+
+
+def _volume(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> float:
+    """Return the volume enclosed by triangles with corners a, b, c (T, 3), outwards positive."""
+    # About a corner of its own: far from the origin the terms would cancel to noise.
+    origin = a[0].copy()
+    a, b, c = a - origin, b - origin, c - origin
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
