@@ -1,5 +1,7 @@
 """``hybridve demo``: the whole job on a generated recording, told command by command."""
 
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from hybridve.cli.calibrate import calibrate
 from hybridve.cli.detect import detect
 from hybridve.cli.render import render
 from hybridve.cli.segment import segment
+from hybridve.cli.summary import summary
 from hybridve.cli.synth import synth
 
 
@@ -37,6 +40,7 @@ def demo(context: click.Context, output: Path, overwrite: bool, progress: bool) 
     session, report = output / "session", output / "report.h5"
     scene = session / "scene.toml"
     picture, seen = output / "picture.png", output / "cameras.png"
+    curves = output / "curves.png"
     output.mkdir(parents=True, exist_ok=True)
 
     def step(text: str, command: click.Command, **values: Any) -> None:
@@ -50,13 +54,21 @@ def demo(context: click.Context, output: Path, overwrite: bool, progress: bool) 
     step(
         f"detect {session} --scene {scene} -o {report}",
         detect,
-        session=session,
-        scene=scene,
+        sessions=(session,),
+        scenes=(scene,),
         output=report,
         **again,
     )
+    with redirect_stdout(StringIO()):  # detect has told the same a moment ago
+        step(
+            f"summary {report} --picture {curves}",
+            summary,
+            report=report,
+            picture=curves,
+            overwrite=overwrite,
+        )
     drawn = {"session": session, "scene": scene, "report": report, "overwrite": overwrite}
     shown = f"render {session} --scene {scene} --report {report}"
     step(f"{shown} -o {picture}", render, output=picture, **drawn)
     step(f"{shown} --view cameras -o {seen}", render, output=seen, view="cameras", **drawn)
-    click.echo(f"report   {report}\npicture  {picture}\ncameras  {seen}")
+    click.echo(f"report   {report}\ncurves   {curves}\npicture  {picture}\ncameras  {seen}")

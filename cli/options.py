@@ -1,6 +1,6 @@
 """Arguments and options that commands share: the same thing has the same name everywhere."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
@@ -10,6 +10,7 @@ EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
+    from hybridve.hull.evaluate import EvaluateSettings
 
 FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
 
@@ -48,10 +49,43 @@ class Frames(click.ParamType["FrameRange"]):
             )
 
 
+class GroupedOption(click.Option):
+    """An option that help shows under a heading of its own; see `GroupedCommand`."""
+
+    def __init__(self, *args: Any, heading: str, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.heading = heading
+
+
+class GroupedCommand(click.Command):
+    """A command whose help shows its options under headings, in the order in which they come."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, those without a heading first."""
+        records: dict[str, list[tuple[str, str]]] = {"Options": []}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx) if isinstance(param, click.Option) else None
+            if record is not None:
+                heading = param.heading if isinstance(param, GroupedOption) else "Options"
+                records.setdefault(heading, []).append(record)
+        for heading, lines in records.items():
+            with formatter.section(heading):
+                formatter.write_dl(lines)
+
+
 session_arg = click.argument("session", type=_path)
+sessions_arg = click.argument("sessions", metavar="SESSION...", nargs=-1, required=True, type=_path)
 report_arg = click.argument("report", type=_path)
 scene_option = click.option(
     "--scene", required=True, type=_path, help="The scene.toml with the CAD objects."
+)
+scenes_option = click.option(
+    "--scene",
+    "scenes",
+    required=True,
+    multiple=True,
+    type=_path,
+    help="The scene.toml with the CAD objects; several to compare layouts.",
 )
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what stands under the output's name."
@@ -81,3 +115,127 @@ quiet_progress = click.option(
 def output_option(what: str) -> Callable[[FC], FC]:
     """Return the option ``-o/--output`` for the file or folder described by `what`."""
     return click.option("-o", "--output", required=True, type=_path, help=what)
+
+
+def response_options(command: FC) -> FC:
+    """Add the options of clearance, response and doubt; see `evaluation_of`."""
+    clearance, response, doubt = "Clearance", "Response", "Doubt"
+    added = (
+        click.option(
+            "--clearance-mm",
+            cls=GroupedOption,
+            heading=clearance,
+            type=click.FloatRange(0),
+            default=0.1,
+            show_default=True,
+            help="Measure how far every object is from the real things, between two bounds at most "
+            "this far apart; 0: do not.",
+        ),
+        click.option(
+            "--response/--no-response",
+            cls=GroupedOption,
+            heading=response,
+            default=True,
+            help="Find which way, and how far, an object that is touched must give. Default: do.",
+        ),
+        click.option(
+            "--abc-deg",
+            cls=GroupedOption,
+            heading=response,
+            type=click.FloatRange(0, 180, min_open=True, max_open=True),
+            default=10.0,
+            show_default=True,
+            help="The paper's triangle ABC: its angle at CP_obj.",
+        ),
+        click.option(
+            "--abc-mm",
+            cls=GroupedOption,
+            heading=response,
+            type=click.FloatRange(0, 2000, min_open=True),
+            default=50.0,
+            show_default=True,
+            help="Its height; contacts deeper than this are not resolved by the paper's form.",
+        ),
+        click.option(
+            "--abc-window",
+            cls=GroupedOption,
+            heading=response,
+            type=click.IntRange(1, 65_535),
+            default=400,
+            show_default=True,
+            help="Samples along its height.",
+        ),
+        click.option(
+            "--backtrack",
+            cls=GroupedOption,
+            heading=response,
+            is_flag=True,
+            help="When a contact begins, take the point of first contact for CP_obj instead of the "
+            "collision point farthest from RP_obj.",
+        ),
+        click.option(
+            "--doubt/--no-doubt",
+            cls=GroupedOption,
+            heading=doubt,
+            default=True,
+            help="Tell what outlines, calibration and single cameras do to every clearance and "
+            "verdict; needs the clearance. Default: do.",
+        ),
+        click.option(
+            "--mask-std-px",
+            cls=GroupedOption,
+            heading=doubt,
+            type=click.FloatRange(0),
+            help="Standard deviation of the silhouettes' outlines, pixels. Default: 1.5.",
+        ),
+    )
+    for option in reversed(added):
+        command = option(command)
+    return command
+
+
+def evaluation_of(
+    *,
+    clearance_mm: float,
+    response: bool,
+    abc_deg: float,
+    abc_mm: float,
+    abc_window: int,
+    backtrack: bool,
+    doubt: bool,
+    mask_std_px: float | None,
+    **others: Any,
+) -> "EvaluateSettings":
+    """Return the settings that the options of `response_options` ask for, and `others` besides.
+
+    Raises
+    ------
+    UsageError
+        If --backtrack is given with --no-response.
+    """
+    from math import radians
+
+    from hybridve.hull.contact.respond import ResponseSettings
+    from hybridve.hull.contact.uncertainty import DoubtSettings
+    from hybridve.hull.evaluate import EvaluateSettings
+
+    if backtrack and not response:
+        raise click.UsageError("--backtrack says where the response begins; drop --no-response")
+    assumed = DoubtSettings() if mask_std_px is None else DoubtSettings(segmentation_px=mask_std_px)
+    return EvaluateSettings(
+        clearance_m=clearance_mm / 1000.0 or None,
+        response=ResponseSettings(radians(abc_deg), abc_mm / 1000.0, abc_window)
+        if response
+        else None,
+        backtrack=backtrack,
+        doubt=assumed if doubt and clearance_mm else None,
+        **others,
+    )
+
+
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of cells in columns, indented; the first row is the heading."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        click.echo("  " + "  ".join(cells).rstrip())

@@ -1,4 +1,4 @@
-"""``hybridve summary``: what a report found, as text or JSON."""
+"""``hybridve summary``: what a report found, as text, JSON or curves."""
 
 import json
 from pathlib import Path
@@ -11,30 +11,57 @@ from hybridve.cli import options
 if TYPE_CHECKING:
     from hybridve.hull.report.read import Report
 
+#: Beginnings of contact that are told of each object; the report and --json have all.
+_MOST_ENTRIES = 5
+
 
 @click.command(short_help="Tell what a report found.")
 @options.report_arg
 @options.json_option
-def summary(report: Path, as_json: bool) -> None:
-    r"""Tell what REPORT found: which objects were touched, when, and how far that can be trusted.
+@click.option(
+    "--picture",
+    type=click.Path(path_type=Path),
+    help="Draw the clearance of each object against time, into a .png, .svg or .pdf.",
+)
+@options.overwrite_option
+def summary(report: Path, as_json: bool, picture: Path | None, overwrite: bool) -> None:
+    r"""Tell what REPORT found: what was touched or came near, when, and how sure that is.
 
     \b
     Example:
-      hybridve summary report.h5
+      hybridve summary report.h5 --picture curves.png
       hybridve summary report.h5 --json | jq '.objects[] | select(.frames_colliding > 0).name'
     """
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.summarize import summarize
 
+    if picture is not None:
+        _refuse_picture(picture, overwrite=overwrite)
     loaded = read_report(report)
+    if picture is not None:
+        from hybridve.hull.curves import write_curves
+
+        write_curves(picture, loaded)
     if as_json:
-        click.echo(json.dumps(summarize(loaded)))
-    else:
-        print_summary(loaded)
+        named = {} if picture is None else {"picture": str(picture)}
+        click.echo(json.dumps({**summarize(loaded), **named}))
+        return
+    print_summary(loaded)
+    if picture is not None:
+        click.echo(f"  clearance against time: {picture}")
+
+
+def _refuse_picture(picture: Path, *, overwrite: bool) -> None:
+    from hybridve.hull.report.write import refuse_existing
+    from hybridve.hull.view.chart import SUFFIXES
+
+    if picture.suffix.lower() not in SUFFIXES:
+        raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
+    refuse_existing(picture, overwrite=overwrite)
 
 
 def print_summary(report: "Report") -> None:
-    """Print a report's summary as a table."""
+    """Print a report's summary: what was touched, what came near, how it began."""
     from hybridve.hull.report.summarize import summarize
 
     numbers = summarize(report)
@@ -56,17 +83,13 @@ def print_summary(report: "Report") -> None:
                 f"{found['triangles_most']}",
             )
         )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        click.echo("  " + "  ".join(cells).rstrip())
+    options.print_table(rows)
+    if any(found["clearance"] is not None for found in numbers["objects"]):
+        _print_clearances(numbers["objects"])
     for found in numbers["objects"]:
-        if missed := found["frames_colliding"] - found["frames_sampled_colliding"]:
-            frames = "1 frame" if missed == 1 else f"{missed} frames"
-            click.echo(
-                f"  {found['name']}: in {frames} no sample collides, but a certified point does; "
-                "--viewport or --accuracy-mm finds more points"
-            )
+        _print_entries(found)
+        for line in _warnings(found):
+            click.echo(f"  {found['name']}: {line}")
     if numbers["sample_spacing_m"] is not None:
         smallest, largest = numbers["viewports"]
         viewports = f"viewport {largest}" if smallest == largest else f"{smallest} to {largest}"
@@ -78,11 +101,127 @@ def print_summary(report: "Report") -> None:
     click.echo(f"  ms of work a frame, mean: {stages}; engine {numbers['engine']}")
 
 
+def _print_clearances(objects: list[dict[str, Any]]) -> None:
+    """Print how near each object was come to, and how deep it was reached into."""
+    rows = [
+        (
+            "object",
+            "smallest clearance, mm (bounds)",
+            "at",
+            "at 95 %, mm (estimate)",
+            "required, mm",
+            "frames below",
+            "deepest, mm (bounds)",
+            "D_rec, mm",
+        )
+    ]
+    for found in objects:
+        nearest, depth, recovery = found["clearance"], found["depth"], found["recovery"]
+        rows.append(
+            (
+                found["name"],
+                "-" if nearest is None else _bounds_text(nearest["lower_m"], nearest["upper_m"]),
+                "-" if nearest is None else f"{nearest['time_s']:.2f} s",
+                "-"
+                if nearest is None or nearest["at_least_95_m"] is None
+                else f"at least {_mm(nearest['at_least_95_m'])}",
+                _mm(found["required_clearance_m"]) if found["required_clearance_m"] else "-",
+                _below_text(found),
+                "-" if depth is None else _bounds_text(depth["lower_m"], depth["upper_m"]),
+                "-" if recovery is None else _mm(recovery["d_rec_m"]),
+            )
+        )
+    options.print_table(rows)
+
+
+def _print_entries(found: dict[str, Any]) -> None:
+    """Print when and how fast contact began."""
+    spans = found["spans"]
+    for span in spans[:_MOST_ENTRIES]:
+        first_s, doubt_s = span.get("first_contact_s"), span.get("first_contact_uncertainty_s")
+        if first_s is None:
+            continue
+        text = f"touched at {first_s:.3f} s"
+        if doubt_s is not None:
+            text += f", {1e3 * doubt_s:.0f} ms either way at most"
+        if status := span.get("first_contact_status"):
+            text += f" ({status})"
+        text += _speed_text(*span.get("approach_m_s", (None, None)))
+        click.echo(f"  {found['name']}: {text}")
+    if len(spans) > _MOST_ENTRIES and "first_contact_s" in spans[0]:
+        click.echo(f"  {found['name']}: {len(spans) - _MOST_ENTRIES} more times; --json tells all")
+
+
+def _warnings(found: dict[str, Any]) -> list[str]:
+    """Return what a reader must know before trusting an object's rows."""
+    lines = []
+    if missed := found["frames_colliding"] - found["frames_sampled_colliding"]:
+        lines.append(
+            f"in {_frames(missed)} no sample collides, but a certified point does; "
+            "--viewport or --accuracy-mm finds more points"
+        )
+    if found["frames_inside"]:
+        lines.append(
+            f"in {_frames(found['frames_inside'])} something is wholly inside, without touching "
+            "the surface"
+        )
+    if found["frames_hinging"]:
+        lines.append(
+            f"in {_frames(found['frames_hinging'])} the verdict hinges on a single camera: "
+            + ", ".join(found["hinges_on"])
+        )
+    if found["frames_unsure"]:
+        lines.append(
+            f"in {_frames(found['frames_unsure'])} what touches may hold nothing real: other "
+            "volumes of the hull explain all its pixels"
+        )
+    return lines
+
+
+def _speed_text(lower_m_s: float | None, upper_m_s: float | None) -> str:
+    """Return the bounds of a speed in words; None where it has none."""
+    if lower_m_s is None:
+        return ""
+    if upper_m_s is None:
+        return f", coming at {lower_m_s:.2f} m/s or more"
+    lower, upper = f"{lower_m_s:.2f}", f"{upper_m_s:.2f}"
+    return f", coming at {lower} m/s" if lower == upper else f", coming at {lower}-{upper} m/s"
+
+
+def _frames(count: int) -> str:
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+def _mm(length_m: float) -> str:
+    return f"{1e3 * length_m:.2f}"
+
+
+def _bounds_text(lower_m: float, upper_m: float | None) -> str:
+    """Return bounds in millimetres; None above stands for no hull anywhere near."""
+    if upper_m is None:
+        return f"beyond {_mm(lower_m)}"
+    return _mm(lower_m) if upper_m == lower_m else f"{_mm(lower_m)}-{_mm(upper_m)}"
+
+
+def _below_text(found: dict[str, Any]) -> str:
+    """Return in how many frames the required clearance is not kept."""
+    if not found["required_clearance_m"] or found["frames_below_required"] is None:
+        return "-"
+    text = f"{found['frames_below_required']}"
+    if perhaps := found["frames_perhaps_below_required"]:
+        text += f", {perhaps} more perhaps"
+    return text
+
+
 def _certain_text(found: dict[str, Any]) -> str:
     """Return how many frames have which certificate, in words."""
     parts = [
         f"{found[key]} {word}"
-        for key, word in (("frames_with_witness", "hit"), ("frames_proved_free", "free"))
+        for key, word in (
+            ("frames_with_witness", "hit"),
+            ("frames_inside", "inside"),
+            ("frames_proved_free", "free"),
+        )
         if found[key]
     ]
     if found["frames_open"]:
@@ -90,7 +229,7 @@ def _certain_text(found: dict[str, Any]) -> str:
     return ", ".join(parts) or "-"
 
 
-def _spans_text(spans: list[dict[str, float]]) -> str:
+def _spans_text(spans: list[dict[str, Any]]) -> str:
     if not spans:
         return "-"
     first, more = spans[0], len(spans) - 1

@@ -10,7 +10,7 @@
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -35,6 +35,7 @@ from hybridve.hull.capture.recording import (
 from hybridve.hull.capture.rig import load_rig, rig_digest
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.contact.backtrack import approach_speed, first_contact
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.detect import (
     Body,
@@ -43,8 +44,10 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
-from hybridve.hull.contact.finding import Finding, agreed, approach_speed
+from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
+from hybridve.hull.contact.respond import Response, ResponseSettings, respond
 from hybridve.hull.contact.scene import Scene
+from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
@@ -68,6 +71,12 @@ class EvaluateSettings:
         Verdicts are certified down to discs of this diameter; None leaves them as sampled.
     clearance_m : float or None
         How far apart the bounds of the clearance may be; None leaves it unmeasured.
+    response : ResponseSettings or None
+        How the way out of the hull is searched; None leaves it alone.
+    backtrack : bool
+        Whether that search begins at the point of first contact in the frame of first contact.
+    doubt : DoubtSettings or None
+        What is assumed of outlines; None, or no clearance, leaves everything undoubted.
     """
 
     frames: FrameRange = field(default_factory=FrameRange)
@@ -75,6 +84,9 @@ class EvaluateSettings:
     accuracy_m: float | None = None
     open_at_m: float | None = 1e-4
     clearance_m: float | None = 1e-4
+    response: ResponseSettings | None = field(default_factory=ResponseSettings)
+    backtrack: bool = False
+    doubt: DoubtSettings | None = field(default_factory=DoubtSettings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,6 +246,7 @@ class _Tools:
     engine: Engine
     certifier: Certifier | None
     meters: list[ClearanceMeter]
+    doubter: Doubter | None
 
     @classmethod
     @contextmanager
@@ -250,8 +263,15 @@ class _Tools:
                 )
                 for part in chain.scene.objects
             ]
+        doubter = None
+        if "doubt" in computed_parts(settings):
+            shift_px = [_mask_shift_px(chain)[name] for name in chain.views.names]
+            errors = outline_errors(
+                chain.views.names, chain.rig.provenance, shift_px, settings.doubt
+            )
+            doubter = Doubter(errors, settings.doubt)
         with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:
-            yield cls(engine, certifier, meters)
+            yield cls(engine, certifier, meters, doubter)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,19 +313,83 @@ def _findings(
     """Return all about one frame, compared with the one before where that could be read."""
     findings = []
     for number, contact in enumerate(seen.contacts):
-        clearance = seen.clearances[number] if seen.clearances else None
-        approach_m_s = (np.nan, np.nan)
-        if clearance is not None and before is not None:
-            approach_m_s = approach_speed(
-                before.clearances[number], clearance, seen.time_s - before.time_s
-            )
-        findings.append(Finding(contact, clearance, approach_m_s))
+        finding = Finding(contact, seen.clearances[number] if seen.clearances else None)
+        if before is not None:
+            finding = _compared(chain, tools, number, before, seen, finding)
+        if finding.touches and chain.settings.response is not None:
+            finding = replace(finding, response=_response(chain, number, seen.hull, finding))
+        findings.append(finding)
+    watch.lap("respond")
+    if tools.doubter is not None:
+        doubts = tools.doubter.frame(seen.hull)
+        findings = [
+            replace(finding, doubt=doubts.doubt(meter, finding.contact, finding.clearance))
+            for finding, meter in zip(findings, tools.meters, strict=True)
+            if finding.clearance is not None
+        ]
+    watch.lap("doubt")
     return tuple(findings)
+
+
+def _compared(
+    chain: Chain, tools: _Tools, number: int, before: _Seen, seen: _Seen, finding: Finding
+) -> Finding:
+    """Return a finding with what the frame before adds to it."""
+    seconds = seen.time_s - before.time_s
+    if finding.clearance is not None:
+        finding = replace(
+            finding,
+            approach_m_s=approach_speed(
+                signed_clearance(before.clearances[number]),
+                signed_clearance(finding.clearance),
+                seconds,
+            ),
+        )
+    earlier = Finding(
+        before.contacts[number], before.clearances[number] if before.clearances else None
+    )
+    if not finding.touches or earlier.clashes:
+        return finding
+    first = first_contact(
+        before.hull,
+        seen.hull,
+        chain.bodies[number],
+        finding.contact,
+        tools.certifier,
+        tools.engine,
+    )
+    return replace(
+        finding,
+        first_contact=first,
+        first_contact_s=before.time_s + first.fraction * seconds,
+        first_contact_uncertainty_s=first.fraction_uncertainty * seconds,
+    )
+
+
+def _response(chain: Chain, number: int, hull: Hull, finding: Finding) -> Response:
+    part = chain.scene.objects[number]
+    begins_at = None
+    if chain.settings.backtrack and finding.first_contact is not None:
+        begins_at = finding.first_contact.point_world
+    return respond(
+        hull,
+        finding.contact,
+        reference_point_world=part.reference_point_world,
+        recovery_direction=part.recovery_direction,
+        settings=chain.settings.response,
+        cp_obj_world=begins_at,
+    )
 
 
 def computed_parts(settings: EvaluateSettings) -> frozenset[Part]:
     """Return what an evaluation computes of each object besides its contact."""
-    parts: dict[Part, bool] = {"clearance": settings.clearance_m is not None}
+    has_clearance = settings.clearance_m is not None
+    parts: dict[Part, bool] = {
+        "clearance": has_clearance,
+        "first contact": True,
+        "response": settings.response is not None,
+        "doubt": has_clearance and settings.doubt is not None,
+    }
     return frozenset(part for part, is_computed in parts.items() if is_computed)
 
 
@@ -334,6 +418,9 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "accuracy_m": chain.settings.accuracy_m,
         "open_at_m": chain.settings.open_at_m,
         "clearance_m": chain.settings.clearance_m,
+        "response": None if chain.settings.response is None else asdict(chain.settings.response),
+        "backtrack": chain.settings.backtrack,
+        "doubt": None if chain.settings.doubt is None else asdict(chain.settings.doubt),
         "unseen": session.unseen,
         "min_cameras": session.min_cameras,
         "mask_threshold": session.mask_threshold,
@@ -349,15 +436,19 @@ def about_rig(chain: Chain) -> dict[str, Any]:
     ``mask_shift_px`` is the bound of `hybridve.calib.lens_bound` in recorded pixels; None for a
     camera that the session does not use, or of which no bound is known.
     """
+    shift_px = _mask_shift_px(chain)
+    about = rig_to_dict(chain.rig)
+    for entry in about["cameras"]:
+        entry["mask_shift_px"] = shift_px.get(entry["name"])
+    return about
+
+
+def _mask_shift_px(chain: Chain) -> dict[str, float | None]:
     shift_px = {
         camera.name: lens_shift_px(chain.rig[camera.name], lens)
         for camera, lens in zip(chain.session.cameras, chain.undistortions, strict=True)
     }
-    about = rig_to_dict(chain.rig)
-    for entry in about["cameras"]:
-        shift = shift_px.get(entry["name"], np.inf)
-        entry["mask_shift_px"] = shift if np.isfinite(shift) else None
-    return about
+    return {name: shift if np.isfinite(shift) else None for name, shift in shift_px.items()}
 
 
 def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:

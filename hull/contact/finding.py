@@ -4,8 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hybridve.hull.contact.backtrack import FirstContact
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.respond import Response
+from hybridve.hull.contact.uncertainty import Doubt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,11 +24,24 @@ class Finding:
     approach_m_s : (float, float)
         Bounds of the mean speed at which hull and object came nearer since the frame before,
         metres per second; negative where they parted.
+    first_contact : FirstContact or None
+        How this contact began, of an object that was free in the frame before.
+    first_contact_s, first_contact_uncertainty_s : float
+        The same instant in seconds from the session's first frame, and how far off it can be.
+    response : Response or None
+        Which way an object that is touched must give.
+    doubt : Doubt or None
+        How far contact and clearance can be trusted.
     """
 
     contact: Contact
     clearance: Clearance | None = None
     approach_m_s: tuple[float, float] = (np.nan, np.nan)
+    first_contact: FirstContact | None = None
+    first_contact_s: float = np.nan
+    first_contact_uncertainty_s: float = np.nan
+    response: Response | None = None
+    doubt: Doubt | None = None
 
     @property
     def touches(self) -> bool:
@@ -38,6 +54,11 @@ class Finding:
         return (
             not self.touches and self.clearance is not None and self.clearance.depth_lower_m > 0.0
         )
+
+    @property
+    def clashes(self) -> bool:
+        """Whether the hull touches the object or is inside it."""
+        return self.touches or self.is_inside
 
 
 def agreed(contact: Contact, clearance: Clearance) -> tuple[Contact, Clearance]:
@@ -62,21 +83,13 @@ def agreed(contact: Contact, clearance: Clearance) -> tuple[Contact, Clearance]:
     return contact, clearance
 
 
-def approach_speed(before: Clearance, after: Clearance, seconds: float) -> tuple[float, float]:
-    """Return bounds of the mean speed at which hull and object came nearer, metres per second.
+def signed_clearance(clearance: Clearance) -> tuple[float, float]:
+    """Return bounds of the clearance, depth counting as negative; metres.
 
-    Depth beneath the surface of a closed object counts as negative distance.
-
-    Parameters
-    ----------
-    before, after : Clearance
-        Of two frames.
-    seconds : float
-        The time between them, above 0.
+    How deep the hull is in an object that is not closed is not known: the lower bound is -inf where
+    it may touch.
     """
-    lower_before_m, upper_before_m = before.signed_m
-    lower_after_m, upper_after_m = after.signed_m
-    return (
-        (lower_before_m - upper_after_m) / seconds,
-        (upper_before_m - lower_after_m) / seconds,
-    )
+    lower_m, upper_m = clearance.signed_m
+    if np.isnan(clearance.depth_lower_m) and clearance.lower_m <= 0.0:
+        lower_m = -np.inf
+    return lower_m, upper_m

@@ -14,6 +14,8 @@ PACKAGES = (
     "numba",
     "moderngl",
     "h5py",
+    "libigl",
+    "scipy",
     "open3d-cpu",
     "open3d",
 )

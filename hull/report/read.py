@@ -49,6 +49,10 @@ class ObjectColumns:
         """Return a column; KeyError if it was not computed."""
         return self.columns[name]
 
+    def get(self, name: str) -> NDArray[Any] | None:
+        """Return a column, or None if it was not computed."""
+        return self.columns.get(name)
+
     @property
     def collides(self) -> NDArray[np.bool_]:
         """Whether a sample is in the hull, (F,)."""
@@ -84,6 +88,19 @@ class ObjectColumns:
         """Whether a point of the surface is in the hull, sampled or certified, (F,)."""
         touches: NDArray[np.bool_] = self.collides | (self.certificate == "colliding")
         return touches
+
+    @property
+    def is_inside(self) -> NDArray[np.bool_]:
+        """Whether the hull is in the closed object without touching its surface, (F,)."""
+        if "depth_m" not in self.columns:
+            return np.zeros(len(self.collides), np.bool_)
+        is_deep: NDArray[np.bool_] = self.columns["depth_m"][:, 0] > 0.0
+        return is_deep & ~self.touches
+
+    @property
+    def clashes(self) -> NDArray[np.bool_]:
+        """Whether the hull touches the object or is inside it, (F,)."""
+        return self.touches | self.is_inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)

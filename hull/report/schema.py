@@ -7,14 +7,18 @@ a new number in a report is one more line in one of them.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.clearance import Clearance
-from hybridve.hull.contact.detect import Contact
-from hybridve.hull.contact.finding import Finding
+if TYPE_CHECKING:  # whoever only reads a report waits for none of these
+    from hybridve.hull.contact.backtrack import FirstContact
+    from hybridve.hull.contact.clearance import Clearance
+    from hybridve.hull.contact.detect import Contact
+    from hybridve.hull.contact.finding import Finding
+    from hybridve.hull.contact.respond import Response
+    from hybridve.hull.contact.uncertainty import Doubt
 
 FORMAT = "hybridve-report"
 VERSION = 1
@@ -28,7 +32,7 @@ STAGES = ("decode", "segment", "query", "certify", "clearance", "respond", "doub
 Kind = Literal["exact", "bound", "estimate", "sampled"]
 
 #: What an evaluation may compute of an object.
-Part = Literal["contact", "clearance", "response", "first contact", "doubt"]
+Part = Literal["contact", "clearance", "first contact", "response", "doubt"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +57,7 @@ class FrameResult:
     index: int
     time_s: float
     reason: str
-    findings: tuple[Finding, ...]
+    findings: "tuple[Finding, ...]"
     stage_s: dict[str, float]
 
     @property
@@ -159,7 +163,7 @@ class Table(Generic[T]):
     """
 
     part: Part
-    of: Callable[[Finding], T | None]
+    of: "Callable[[Finding], T | None]"
     columns: tuple[Column[T], ...]
 
 
@@ -211,7 +215,7 @@ FRAME_COLUMNS: tuple[Column[FrameResult], ...] = (
     *(_stage(name) for name in STAGES),
 )
 
-_CONTACT: tuple[Column[Contact], ...] = (
+_CONTACT: "tuple[Column[Contact], ...]" = (
     Column(
         "collides",
         "1",
@@ -265,7 +269,7 @@ _CONTACT: tuple[Column[Contact], ...] = (
     ),
 )
 
-_CLEARANCE: tuple[Column[Clearance], ...] = (
+_CLEARANCE: "tuple[Column[Clearance], ...]" = (
     Column(
         "clearance_m",
         "m",
@@ -308,7 +312,7 @@ _CLEARANCE: tuple[Column[Clearance], ...] = (
     ),
 )
 
-_APPROACH: tuple[Column[Finding], ...] = (
+_APPROACH: "tuple[Column[Finding], ...]" = (
     Column(
         "approach_m_s",
         "m/s",
@@ -322,15 +326,219 @@ _APPROACH: tuple[Column[Finding], ...] = (
     ),
 )
 
+_INSTANT: "tuple[Column[Finding], ...]" = (
+    Column(
+        "first_contact_s",
+        "s",
+        "estimate",
+        "when the hull first touched the object, from the session's first frame; in the first "
+        "colliding frame after one without, else NaN",
+        np.float64,
+        lambda finding: finding.first_contact_s,
+    ),
+    Column(
+        "first_contact_uncertainty_s",
+        "s",
+        "bound",
+        "how far off first_contact_s can be",
+        np.float64,
+        lambda finding: finding.first_contact_uncertainty_s,
+    ),
+)
+
+_FIRST_CONTACT: "tuple[Column[FirstContact], ...]" = (
+    Column(
+        "first_contact_m",
+        "m",
+        "estimate",
+        "where the hull first touched the object's surface, world frame",
+        np.float64,
+        lambda first: first.point_world,
+        shape=(3,),
+    ),
+    Column(
+        "first_contact_status",
+        "1",
+        "exact",
+        "what is wrong with first_contact_s and first_contact_m; empty if nothing is",
+        str,
+        lambda first: first.status,
+    ),
+)
+
+_RESPONSE: "tuple[Column[Response], ...]" = (
+    Column(
+        "cp_obj_m",
+        "m",
+        "sampled",
+        "CP_obj, world frame: the collision point farthest from RP_obj, or that of first contact "
+        "where it was asked for; NaN where nothing collides",
+        np.float64,
+        lambda response: response.cp_obj_world,
+        shape=(3,),
+    ),
+    Column(
+        "v_rec",
+        "1",
+        "exact",
+        "V_rec, unit vector, world frame: the way the object is moved out of the hull",
+        np.float64,
+        lambda response: response.v_rec,
+        shape=(3,),
+    ),
+    Column(
+        "cp_hull_m",
+        "m",
+        "exact",
+        "CP_hull, world frame: where the ray from CP_obj along V_rec leaves the hull",
+        np.float64,
+        lambda response: response.cp_hull_world,
+        shape=(3,),
+    ),
+    Column(
+        "d_rec_m",
+        "m",
+        "exact",
+        "D_rec: from CP_obj to CP_hull; moves CP_obj out, not necessarily the whole object",
+        np.float64,
+        lambda response: response.d_rec_m,
+    ),
+    Column(
+        "n_hull",
+        "1",
+        "estimate",
+        "N_hull, unit vector out of the hull, world frame: of the smoothed outline at CP_hull",
+        np.float64,
+        lambda response: response.n_hull,
+        shape=(3,),
+    ),
+    Column(
+        "response_status",
+        "1",
+        "exact",
+        "what is wrong with the columns before it; empty if nothing is",
+        str,
+        lambda response: response.status,
+    ),
+    Column(
+        "cp_hull_paper_m",
+        "m",
+        "sampled",
+        "CP_hull as published: the first sample of triangle ABC within the hull",
+        np.float64,
+        lambda response: response.cp_hull_paper_world,
+        shape=(3,),
+    ),
+    Column(
+        "d_rec_paper_m",
+        "m",
+        "sampled",
+        "D_rec as published",
+        np.float64,
+        lambda response: response.d_rec_paper_m,
+    ),
+    Column(
+        "n_hull_paper",
+        "1",
+        "sampled",
+        "N_hull as published: the cross product of IJ and KL",
+        np.float64,
+        lambda response: response.n_hull_paper,
+        shape=(3,),
+    ),
+    Column(
+        "response_status_paper",
+        "1",
+        "exact",
+        "what is wrong with the columns as published; empty if nothing is",
+        str,
+        lambda response: response.status_paper,
+    ),
+)
+
+_DOUBT: "tuple[Column[Doubt], ...]" = (
+    Column(
+        "clearance_std_m",
+        "m",
+        "estimate",
+        "standard deviation of the clearance, from outlines and calibration; of the depth, where "
+        "the hull reaches into a closed object",
+        np.float64,
+        lambda doubt: doubt.std_m,
+    ),
+    Column(
+        "clearance_at_least_m",
+        "m",
+        "estimate",
+        "what the clearance is at least, at 95 %",
+        np.float64,
+        lambda doubt: doubt.at_least_m,
+    ),
+    Column(
+        "real_clearance_at_most_m",
+        "m",
+        "bound",
+        "the real thing is not farther away than this, given right silhouettes; inf if unknown",
+        np.float64,
+        lambda doubt: doubt.real_upper_m,
+    ),
+    Column(
+        "m_per_px",
+        "m/px",
+        "estimate",
+        "by how much the clearance falls when a camera's outline moves outward by a pixel",
+        np.float64,
+        lambda doubt: doubt.mm_per_px,
+        shape=("C",),
+    ),
+    Column(
+        "n_seeing",
+        "1",
+        "exact",
+        "cameras that see the contact, or the point of the hull that is nearest",
+        np.uint32,
+        lambda doubt: doubt.n_seeing,
+    ),
+    Column(
+        "survives",
+        "1",
+        "exact",
+        "whether the verdict, touched or not, stands with any one camera left out",
+        np.bool_,
+        lambda doubt: doubt.survives,
+    ),
+    Column(
+        "hinges_on",
+        "1",
+        "exact",
+        "the cameras without which it does not",
+        str,
+        lambda doubt: ", ".join(doubt.hinges_on),
+    ),
+    Column(
+        "component",
+        "1",
+        "bound",
+        "the volume of the hull that touches or is nearest; real: it holds something real, given "
+        "right silhouettes; unsure: other volumes explain all that it does, as of a phantom",
+        str,
+        lambda doubt: doubt.component,
+    ),
+)
+
 #: Of each object, one row a frame.
 TABLES: tuple[Table[Any], ...] = (
     Table("contact", lambda finding: finding.contact, _CONTACT),
     Table("clearance", lambda finding: finding.clearance, _CLEARANCE),
     Table("clearance", lambda finding: finding, _APPROACH),
+    Table("first contact", lambda finding: finding, _INSTANT),
+    Table("first contact", lambda finding: finding.first_contact, _FIRST_CONTACT),
+    Table("response", lambda finding: finding.response, _RESPONSE),
+    Table("doubt", lambda finding: finding.doubt, _DOUBT),
 )
 
 #: Of each object, one row a collision point.
-POINT_COLUMNS: tuple[Column[Contact], ...] = (
+POINT_COLUMNS: "tuple[Column[Contact], ...]" = (
     Column(
         "points/xyz_m",
         "m",

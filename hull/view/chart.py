@@ -1,4 +1,4 @@
-"""Accuracy against time, drawn: one curve a method, and the points that nothing beats."""
+"""Charts: accuracy against time, and clearance against time."""
 
 import textwrap
 from collections.abc import Sequence
@@ -69,6 +69,39 @@ class Curve:
     is_chosen: NDArray[np.bool_]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ClearanceCurve:
+    """How far one object was from the hull, F frames.
+
+    Attributes
+    ----------
+    name : str
+        The object.
+    time_s : (F,) float64
+        Ascending.
+    lower_mm, upper_mm : (F,) float64
+        Bounds of the clearance, depth beneath the surface of a closed object counting as negative;
+        NaN where a frame was not evaluated, inf above where no hull was found.
+    at_least_mm : (F,) float64
+        What the clearance is at least, at 95 %; NaN where unknown.
+    clashes : (F,) bool
+        Frames in which the hull touches the object or is inside it.
+    required_mm : float
+        How far real things are to stay away; 0 if nothing is required.
+    first_contact_s : (E,) float64
+        When contact began, each time.
+    """
+
+    name: str
+    time_s: NDArray[np.float64]
+    lower_mm: NDArray[np.float64]
+    upper_mm: NDArray[np.float64]
+    at_least_mm: NDArray[np.float64]
+    clashes: NDArray[np.bool_]
+    required_mm: float
+    first_contact_s: NDArray[np.float64]
+
+
 def write_chart(
     path: Path,
     curves: Sequence[Curve],
@@ -100,9 +133,17 @@ def write_chart(
     ValueError
         If the name has another ending.
     """
+    _refuse_suffix(path)
+    _save(draw_chart(curves, chosen, title=title, subtitle=subtitle, note=note), path)
+
+
+def _refuse_suffix(path: Path) -> None:
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path}: charts are {', '.join(SUFFIXES)}")
-    figure = draw_chart(curves, chosen, title=title, subtitle=subtitle, note=note)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    """Write a figure, which appears only when it is complete."""
     partial = path.with_name(path.name + ".partial")
     try:
         figure.savefig(partial, format=path.suffix.lower()[1:], dpi=_DPI)
@@ -265,3 +306,116 @@ def _label_axes(tradeoff: Axes, missed: Axes, chosen: str) -> None:
         axis.set_major_formatter(plain)
     for axis in (tradeoff.xaxis, tradeoff.yaxis):
         axis.set_minor_formatter(NullFormatter())
+
+
+_BOUNDS, _AT_LEAST, _CLASH, _REQUIRED = "#0072B2", "#009E73", "#D55E00", "#CC79A7"
+
+#: Height of an object's panel, and of all around the panels, inches.
+_PANEL_IN, _AROUND_IN = 1.7, 1.3
+
+
+def write_clearances(
+    path: Path, curves: Sequence[ClearanceCurve], *, title: str, note: str = ""
+) -> None:
+    """Draw clearance against time, one panel an object, into a picture.
+
+    It appears only when it is complete.
+
+    Parameters
+    ----------
+    path : Path
+        A .png, .svg or .pdf.
+    curves : sequence of ClearanceCurve
+        At least one.
+    title, note : str
+        Above the panels.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    ValueError
+        If the name has another ending.
+    """
+    _refuse_suffix(path)
+    _save(draw_clearances(curves, title=title, note=note), path)
+
+
+def draw_clearances(curves: Sequence[ClearanceCurve], *, title: str, note: str = "") -> Figure:
+    """Return the figure of `write_clearances`."""
+    height_in = _AROUND_IN + _PANEL_IN * len(curves)
+    figure = Figure(figsize=(_SIZE_IN[0], height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(curves), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, curve in zip(panels, curves, strict=True):
+        _draw_clearance(axes, curve)
+    panels[-1].set_xlabel("seconds from the session's first frame")
+    handles = {
+        label: handle
+        for axes in panels
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles), fontsize=8
+    )
+    figure.suptitle("\n".join([*textwrap.wrap(title, 110), note]).strip(), fontsize=10)
+    return figure
+
+
+def _draw_clearance(axes: Axes, curve: ClearanceCurve) -> None:
+    time_s = curve.time_s
+    upper_mm = np.where(np.isfinite(curve.upper_mm), curve.upper_mm, np.nan)
+    lower_mm = np.where(np.isfinite(curve.lower_mm), curve.lower_mm, np.nan)
+    # A band a tenth of a millimetre wide would not be seen: its edges are drawn as lines.
+    axes.fill_between(
+        time_s, lower_mm, upper_mm, color=_BOUNDS, alpha=0.35, linewidth=0, label="bounds"
+    )
+    for edge_mm in (lower_mm, upper_mm):
+        axes.plot(time_s, edge_mm, color=_BOUNDS, linewidth=0.9)
+    if not np.isnan(curve.at_least_mm).all():
+        axes.plot(
+            time_s,
+            curve.at_least_mm,
+            color=_AT_LEAST,
+            linewidth=0.9,
+            label="at least, at 95 % (estimate)",
+        )
+    if curve.required_mm > 0:
+        axes.axhline(
+            curve.required_mm, color=_REQUIRED, linewidth=1.2, linestyle="--", label="required"
+        )
+    axes.axhline(0.0, color=_INK, linewidth=0.6)
+    axes.fill_between(
+        time_s,
+        0.0,
+        np.where(curve.clashes, np.minimum(lower_mm, 0.0), np.nan),
+        color=_CLASH,
+        alpha=0.5,
+        linewidth=0,
+    )
+    half_s = 0.5 * float(np.diff(time_s).min()) if len(time_s) > 1 else 0.5
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], curve.clashes, [False]])))
+    for number, (first, after) in enumerate(edges.reshape(-1, 2)):
+        axes.axvspan(
+            time_s[first] - half_s,
+            time_s[after - 1] + half_s,
+            color=_CLASH,
+            alpha=0.15,
+            linewidth=0,
+            label="" if number else "collides",
+        )
+    if len(curve.first_contact_s):
+        axes.plot(
+            curve.first_contact_s,
+            np.zeros(len(curve.first_contact_s)),
+            linestyle="none",
+            marker="v",
+            markersize=7,
+            color=_INK,
+            label="first contact (estimate)",
+        )
+    axes.set_xlim(time_s[0] - half_s, time_s[-1] + half_s)
+    axes.set_title(curve.name, fontsize=9, loc="left", pad=2)
+    axes.set_ylabel("mm", fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.grid(color="#DDDDDD", linewidth=0.5)

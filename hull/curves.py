@@ -1,0 +1,57 @@
+"""A report as curves: the clearance of each object against time."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hybridve.calib.errors import ReportError
+from hybridve.hull.report.read import ObjectColumns, Report
+from hybridve.hull.view.chart import ClearanceCurve, write_clearances
+
+#: Panels in one picture, the nearest objects; more could not be read.
+_MOST_PANELS = 12
+
+
+def write_curves(path: Path, report: Report) -> None:
+    """Draw the clearance of each object of a report against time.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written, or the report has no clearances or no frames.
+    """
+    curves = [
+        _curve(name, rows, report) for name, rows in report.objects.items() if "clearance_m" in rows
+    ]
+    if not curves:
+        raise ReportError(
+            f"{report.path}: holds no clearances to draw; make it again without --clearance-mm 0"
+        )
+    nearest = sorted(curves, key=_nearest_mm)[:_MOST_PANELS]
+    shown = [curve for curve in curves if curve in nearest]  # in the scene's order
+    note = ""
+    if len(shown) < len(curves):
+        note = f"the nearest {len(shown)} of {len(curves)} objects"
+    title = f"{report.path.name}: clearance between the hull and each object"
+    write_clearances(path, shown, title=title, note=note)
+
+
+def _curve(name: str, rows: ObjectColumns, report: Report) -> ClearanceCurve:
+    lower_m, upper_m = rows["clearance_m"].T
+    shallow_m, deep_m = np.nan_to_num(rows["depth_m"]).T
+    at_least_m = rows.get("clearance_at_least_m")
+    first_s = rows.get("first_contact_s")
+    return ClearanceCurve(
+        name=name,
+        time_s=report.time_s,
+        lower_mm=1e3 * (lower_m - deep_m),
+        upper_mm=1e3 * (upper_m - shallow_m),
+        at_least_mm=1e3 * at_least_m if at_least_m is not None else np.full(len(lower_m), np.nan),
+        clashes=rows.clashes,
+        required_mm=1e3 * float(rows.about.get("required_clearance_m", 0.0)),
+        first_contact_s=np.zeros(0) if first_s is None else first_s[np.isfinite(first_s)],
+    )
+
+
+def _nearest_mm(curve: ClearanceCurve) -> float:
+    return float(np.fmin.reduce(curve.lower_mm, initial=np.inf))
