@@ -80,9 +80,11 @@ def buffer_names(content: bytes) -> list[str]:
         If the file is damaged.
     """
     document, _ = _split(content)
-    buffers = document.get("buffers", [])
-    names = [buffer["uri"] for buffer in buffers if isinstance(buffer, dict) and "uri" in buffer]
-    return [urllib.parse.unquote(name) for name in names if not name.startswith("data:")]
+    try:
+        names = [buffer["uri"] for buffer in document.get("buffers", []) if "uri" in buffer]
+        return [urllib.parse.unquote(name) for name in names if not name.startswith("data:")]
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"not a sound glTF 2.0 file: {error}") from error
 
 
 def _split(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -109,8 +111,8 @@ def _split(content: bytes) -> tuple[dict[str, Any], bytes]:
         document = json.loads(text)
     except ValueError as error:
         raise ValueError(f"its JSON cannot be read: {error}") from None
-    version = document.get("asset", {}).get("version") if isinstance(document, dict) else None
-    if not str(version).startswith("2."):
+    asset = document.get("asset") if isinstance(document, dict) else None
+    if not isinstance(asset, dict) or not str(asset.get("version")).startswith("2."):
         raise ValueError("it is not glTF of version 2")
     return document, binary
 
