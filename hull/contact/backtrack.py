@@ -24,6 +24,7 @@ the status "outline lost": then the instant is unknown within the frame.
 import itertools
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -58,10 +59,16 @@ _MOST_MOVES = 6
 _SEARCH_PX = 96
 
 #: Pixels that judge a shift, at most.
-_JUDGES = 2000
+_JUDGES = 1000
+
+#: Shifts are about as good if they lack at most this share of what the best gains.
+_AS_GOOD = 0.2
 
 #: A shift must leave at most this share of the changed pixels unexplained.
 _UNEXPLAINED = 0.5
+
+#: A change of this width is an outline that moved by a pixel or two.
+_OUTLINE_PX = 2.0
 
 #: Halfway, a blend covers about half of what was gained; below this share its outline is lost.
 _LOST_SHARE = 0.25
@@ -455,13 +462,16 @@ def _find_moves(
 ) -> list[_Move]:
     """Return the shifts that explain what changed between two masks, largest change first.
 
-    Changed pixels are joined into clusters. A cluster that a plain blend would thin, because the
-    change is more than an outline wide, looks for the shift under which both masks agree in it.
+    None if one mask lies within the other: what grows is only blended, and so grows all the time.
+    Else changed pixels are joined into clusters. A cluster that a plain blend would thin, because
+    the change is wider than an outline, looks for the shift under which both masks agree in it.
     """
     reach = max(16, changed[1] - changed[0], changed[3] - changed[2])
     crop = _intersection(_grown(changed, reach), (0, before.shape[0], 0, before.shape[1]))
     first, second = before[_slices(crop)], after[_slices(crop)]
     left_over = difference[_slices(crop)].copy()
+    if not (left_over & first).any() or not (left_over & second).any():
+        return []
     near = cv2.dilate(left_over, np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(near, connectivity=8)
     areas = np.bincount(labels[left_over.view(np.bool_)], minlength=len(stats))
@@ -477,8 +487,8 @@ def _find_moves(
             continue  # explained by an earlier shift
         kept = int((first[part] & second[part] & cluster).sum())
         thickness_px = cv2.distanceTransform(change, cv2.DIST_L2, cv2.DIST_MASK_3).max()
-        if thickness_px < 2.0 and 2 * kept >= areas[label]:
-            continue  # an outline that moved by a pixel or two
+        if thickness_px < _OUTLINE_PX and 2 * kept >= areas[label]:
+            continue
         shift_px = _shift_of(first, second, (top, top + height, left, left + width), cluster)
         if shift_px == (0, 0):
             continue
@@ -497,22 +507,30 @@ def _shift_of(
     """Return the shift (x, y) under which two masks agree in a cluster; (0, 0) if there is none.
 
     Agreement is counted both ways: the pixels of the cluster in `after` against `before`, and
-    those in `before` against `after`; everywhere by correlation in reduced images, then exactly.
+    those in `before` against `after`; everywhere by correlation in reduced images, then by pixels.
     """
     factor = max(1, -(-max(before.shape) // _SEARCH_PX))
-    masks = [mask.astype(np.float32) for mask in (before, after)]
+    masks = [mask.astype(np.float64) for mask in (before, after)]
     parts = [np.zeros_like(mask) for mask in masks]
     for part, mask in zip(parts, masks, strict=True):
-        part[_slices(box)] = (2.0 * mask[_slices(box)] - 1.0) * cluster
+        # Background as a whole weighs no more than what is thin in it, which reducing blurs.
+        here = mask[_slices(box)] * cluster
+        n_object, n_background = here.sum(), (cluster > here).sum()
+        weight = min(1.0, n_object / n_background) if n_object and n_background else 1.0
+        part[_slices(box)] = here - weight * (cluster > here)
     small = [_reduced(image, factor) for image in (*masks, *parts)]
     size = tuple(cv2.getOptimalDFTSize(2 * length) for length in small[0].shape)
     before_f, after_f, part_before_f, part_after_f = (np.fft.rfft2(image, size) for image in small)
     agreement = np.fft.irfft2(
         part_after_f * np.conj(before_f) + np.conj(part_before_f) * after_f, size
     )
-    # In units of one pixel: whole numbers, so that ties are ties.
+    # To whole pixels, so that ties are ties. Of peaks that are about as good the shortest shift: of
+    # two like things each came from where it was, not from where the other was.
     agreement = np.rint(agreement * factor**2)
-    rows, columns = np.nonzero(agreement == agreement.max())
+    most = agreement.max()  # 0 where nothing meets anything
+    enough = most - _AS_GOOD * max(0.0, min(most, most - agreement[0, 0]))
+    is_peak = agreement == cv2.dilate(agreement, np.ones((3, 3), np.uint8))
+    rows, columns = np.nonzero(is_peak & (agreement >= enough))
     ys = np.where(rows * 2 >= size[0], rows - size[0], rows)
     xs = np.where(columns * 2 >= size[1], columns - size[1], columns)
     nearest = int(np.argmin(ys**2 + xs**2))
@@ -523,36 +541,36 @@ def _shift_of(
     at_y, at_x = at_y[::every] + box[0], at_x[::every] + box[2]
     here_before, here_after = before[at_y, at_x], after[at_y, at_x]
 
-    def disagreement(x: int, y: int) -> int:
-        count = 0
+    @cache
+    def judged(x: int, y: int) -> tuple[int, int, int, int]:
+        """Return how much disagrees, then what settles ties: the shorter shift, then any order."""
+        disagree = 0
         for mask, here, sign in ((before, here_after, -1), (after, here_before, 1)):
             rows = np.clip(at_y + sign * y, 0, mask.shape[0] - 1)
             columns = np.clip(at_x + sign * x, 0, mask.shape[1] - 1)
-            count += int(np.count_nonzero(mask[rows, columns] != here))
-        return count
+            disagree += int(np.count_nonzero(mask[rows, columns] != here))
+        return disagree, x * x + y * y, y, x
 
-    # Least disagreement, then the shortest shift; the last two make the order total.
-    best = (disagreement(x, y), x * x + y * y, y, x)
+    best = judged(x, y)
     step = factor
     while step >= 1:
         _, _, y, x = best
-        steps = [(x + step * i, y + step * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        best = min(best, *((disagreement(u, v), u * u + v * v, v, u) for u, v in steps))
+        best = min(judged(x + step * i, y + step * j) for i in (-1, 0, 1) for j in (-1, 0, 1))
         if best[2:] == (y, x):
             step //= 2
-    if best[0] > _UNEXPLAINED * disagreement(0, 0):
+    if best[0] > _UNEXPLAINED * judged(0, 0)[0]:
         return 0, 0
     return best[3], best[2]
 
 
-def _reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+def _reduced(image: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
     """Return means over squares of `factor` pixels; those beyond the border count as 0."""
     height, width = image.shape
     padded = cv2.copyMakeBorder(
         image, 0, -height % factor, 0, -width % factor, cv2.BORDER_CONSTANT, value=0.0
     )
     size = (padded.shape[1] // factor, padded.shape[0] // factor)
-    return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), np.float64)
 
 
 def _explain(
@@ -620,10 +638,9 @@ def _outline_is_lost(
         left, top, box_width, box_height, area = stats[label].tolist()
         box = (top, top + box_height, left, left + box_width)
         crop = _intersection(_grown(box, _CAP_PX), (0, *gained.shape[:1], 0, *gained.shape[1:]))
-        halfway = (
-            _signed_distance(outline.before[_slices(crop)])
-            + _signed_distance(outline.after[_slices(crop)])
-        ) > 0
+        distance_before = _signed_distance(outline.before[_slices(crop)])
+        halfway = distance_before + _signed_distance(outline.after[_slices(crop)]) > 0
+        halfway |= distance_before > -_OUTLINE_PX  # that near, there is nothing to lose
         covered = int(np.count_nonzero(halfway & (labels[_slices(crop)] == label)))
         if covered < _LOST_SHARE * area:
             return True
