@@ -175,9 +175,11 @@ def _parse_fbx(path: Path) -> Contents:
 
 
 #: Runs by itself, because OpenCASCADE talks on stdout, where our results go, and because a damaged
-#: file has been known to end the process that reads it.
+#: file may end the process that reads it. cascadio would import trimesh, for nothing we need.
 _CONVERT = """
-import sys, cascadio
+import sys
+sys.modules["trimesh"] = None
+import cascadio
 source, target, linear_mm, angle_rad = sys.argv[1:]
 cascadio.step_to_glb(source, target, float(linear_mm), float(angle_rad), False, True, False)
 """
@@ -185,8 +187,7 @@ cascadio.step_to_glb(source, target, float(linear_mm), float(angle_rad), False, 
 
 def _parse_step(content: bytes, tessellation_m: float) -> Contents:
     """Return the parts of a STEP file in metres, named after their products, not their places."""
-    # A message of its own: from the other process it would be a traceback.
-    version("cascadio")
+    version("cascadio")  # raises here, where the package can be named, if it is not there
     with tempfile.TemporaryDirectory(prefix="hybridve-") as folder:
         source, target = Path(folder, "part.step"), Path(folder, "part.glb")
         source.write_bytes(content)

@@ -97,15 +97,18 @@ def _places(vertices: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
 
     Or that are joined by others between them, each no farther from the next.
     """
-    columns = np.zeros(vertices.shape, np.int64)
-    for axis in range(3):
-        order = np.argsort(vertices[:, axis])
-        is_new = np.diff(vertices[order, axis]) > apart
-        columns[order[1:], axis] = np.cumsum(is_new)
-    order = np.lexsort(columns.T)
-    is_new = (columns[order[1:]] != columns[order[:-1]]).any(axis=1)
     places = np.zeros(len(vertices), np.int64)
-    places[order[1:]] = np.cumsum(is_new)
+    for axis in range(3):
+        coordinates = vertices[:, axis]
+        order = np.argsort(coordinates)
+        steps = np.cumsum(np.diff(coordinates[order]) > apart)
+        column = np.zeros(len(vertices), np.int64)
+        column[order[1:]] = steps
+        # Both are below the number of vertices, so that their pairs fit into 64 bits.
+        pairs = places * (len(vertices) + 1) + column
+        order = np.argsort(pairs)
+        places = np.zeros(len(vertices), np.int64)
+        places[order[1:]] = np.cumsum(np.diff(pairs[order]) > 0)
     return places
 
 
