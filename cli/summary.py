@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 #: Beginnings of contact that are told of each object; the report and --json have all.
 _MOST_ENTRIES = 5
 
+#: Names in a list of objects.
+_MOST_NAMES = 8
+
 
 @click.command(short_help="Tell what a report found.")
 @options.report_arg
@@ -90,6 +93,17 @@ def print_summary(report: "Report") -> None:
         _print_entries(found)
         for line in _warnings(found):
             click.echo(f"  {found['name']}: {line}")
+    is_open = [
+        found["name"]
+        for found in numbers["objects"]
+        if found["closed"] is False and found["clearance"] is not None
+    ]
+    if is_open:
+        more = f" and {len(is_open) - _MOST_NAMES} more" if len(is_open) > _MOST_NAMES else ""
+        click.echo(
+            "  not closed, so that nobody can tell whether something is wholly inside: "
+            f"{', '.join(is_open[:_MOST_NAMES])}{more}"
+        )
     if numbers["sample_spacing_m"] is not None:
         smallest, largest = numbers["viewports"]
         viewports = f"viewport {largest}" if smallest == largest else f"{smallest} to {largest}"

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.calib.lens import Undistortion, trimmed, undistortion
@@ -258,7 +257,7 @@ class _Tools:
                 ClearanceMeter(
                     part.vertices_world,
                     part.faces,
-                    is_closed=is_closed(part.vertices_world, part.faces),
+                    is_closed=part.is_closed,
                     tolerance_m=settings.clearance_m,
                 )
                 for part in chain.scene.objects
@@ -455,6 +454,7 @@ def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
     """Return what the report says of each object, as plain JSON values."""
     return tuple(
         {
+            **scene_object.about,
             "name": body.name,
             "mesh": str(scene_object.mesh_path),
             "triangles": len(body.triangles),
@@ -463,30 +463,9 @@ def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
             "samples": int(body.triangles.topology.samples_before[-1]),
             "sample_spacing_m": body.spacing_m,
             "required_clearance_m": scene_object.required_clearance_m,
-            "closed": is_closed(scene_object.vertices_world, scene_object.faces),
         }
         for scene_object, body in zip(chain.scene.objects, chain.bodies, strict=True)
     )
-
-
-def is_closed(vertices_world: NDArray[np.float64], faces: NDArray[np.int32]) -> bool:
-    """Tell whether a mesh bounds a solid: every edge has two triangles, which agree on outside.
-
-    Parameters
-    ----------
-    vertices_world : (V, 3) float64
-        Vertices in the same place are one.
-    faces : (T, 3) int32
-        Vertex numbers; triangles that two of their corners share one place do not count.
-    """
-    _, welded = np.unique(vertices_world, axis=0, return_inverse=True)
-    corners = welded.reshape(-1)[faces]
-    distinct = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    corners = corners[distinct]
-    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
-    there, counts = np.unique(edges, axis=0, return_counts=True)
-    back = np.unique(edges[:, ::-1], axis=0)
-    return len(edges) > 0 and bool((counts == 1).all()) and np.array_equal(there, back)
 
 
 def _silhouettes(

@@ -1,8 +1,9 @@
 """A report is complete or absent, and what is written is what is read."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import h5py
 import numpy as np
@@ -12,11 +13,15 @@ from hypothesis import strategies as st
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from hybridve.calib.errors import ReportError
+from hybridve.hull.contact.backtrack import FirstContact
+from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.finding import Finding
+from hybridve.hull.contact.respond import Response
+from hybridve.hull.contact.uncertainty import Doubt
 from hybridve.hull.report import write
 from hybridve.hull.report.read import read_points, read_report
-from hybridve.hull.report.schema import STAGES, FrameResult, ReportHeader
+from hybridve.hull.report.schema import STAGES, FrameResult, Kind, ReportHeader
 from hybridve.hull.report.summarize import spans, summarize
 from hybridve.hull.report.write import ReportWriter
 
@@ -24,6 +29,10 @@ from hybridve.hull.report.write import ReportWriter
 _FEW = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
+
+
+CAMERAS = ("left", "right", "top")
+PARTS = ("clearance", "first contact", "response", "doubt")
 
 
 def a_header(n_objects: int, **changes: Any) -> ReportHeader:
@@ -34,6 +43,7 @@ def a_header(n_objects: int, **changes: Any) -> ReportHeader:
         "rig": {"cameras": []},
         "engine": "native",
         "renderer": "a processor",
+        "cameras": CAMERAS,
     }
     return ReportHeader(**(values | changes))
 
@@ -42,35 +52,68 @@ def a_result(index: int, *contacts: Contact, reason: str = "") -> FrameResult:
     return FrameResult(index, index / 25, reason, tuple(map(Finding, contacts)), {})
 
 
+def a_contact(draw: st.DrawFn, rng: np.random.Generator) -> Contact:
+    n_points = draw(st.integers(0, 4))
+    certificate = draw(st.sampled_from(["colliding", "free", "open", ""]))
+    return Contact(
+        certificate,
+        rng.normal(size=(n_points, 3)).astype(np.float32),
+        np.sort(rng.integers(0, 3, n_points)).astype(np.uint32),
+        rng.normal(size=3) if certificate == "colliding" else np.full(3, np.nan),
+        rng.uniform() if certificate == "open" else np.nan,
+    )
+
+
+def a_finding(draw: st.DrawFn, rng: np.random.Generator) -> Finding:
+    """Return a finding in which every number differs from every other, and parts are missing."""
+    number, vector = rng.normal, lambda: rng.normal(size=3)
+    there = {part for part in PARTS if draw(st.booleans())}
+    clearance = Clearance(number(), number(), vector(), vector(), number(), number())
+    first = FirstContact(number(), number(), vector(), "outline lost")
+    response = Response(
+        vector(),
+        vector(),
+        vector(),
+        vector(),
+        number(),
+        "no exit",
+        vector(),
+        vector(),
+        number(),
+        "",
+    )
+    hinges_on = draw(st.sampled_from([(), ("left",), ("left", "top")]))
+    doubt = Doubt(
+        number(), number(), number(), vector(), False, 2, not hinges_on, hinges_on, "unsure"
+    )
+    return Finding(
+        a_contact(draw, rng),
+        clearance if "clearance" in there else None,
+        (number(), number()),
+        first if "first contact" in there else None,
+        number(),
+        number(),
+        response if "response" in there else None,
+        doubt if "doubt" in there else None,
+    )
+
+
 @st.composite
 def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     results = []
     for index in range(draw(st.integers(1, 9))):
         reason = draw(st.sampled_from(["", "", "", "camera 'ü' has stopped recording"]))
-        contacts = []
-        for _ in range(0 if reason else n_objects):
-            n_points = draw(st.integers(0, 4))
-            certificate = draw(st.sampled_from(["colliding", "free", "open", ""]))
-            has_witness, is_open = certificate == "colliding", certificate == "open"
-            contacts.append(
-                Contact(
-                    certificate,
-                    rng.normal(size=(n_points, 3)).astype(np.float32),
-                    np.sort(rng.integers(0, 3, n_points)).astype(np.uint32),
-                    rng.normal(size=3) if has_witness else np.full(3, np.nan),
-                    rng.uniform() if is_open else np.nan,
-                )
-            )
+        findings = tuple(a_finding(draw, rng) for _ in range(0 if reason else n_objects))
         stage_s = dict(zip(STAGES, rng.uniform(size=len(STAGES)).tolist(), strict=True))
-        results.append(
-            FrameResult(index, index / 25, reason, tuple(map(Finding, contacts)), stage_s)
-        )
+        results.append(FrameResult(index, index / 25, reason, findings, stage_s))
     return results
 
 
-def write_all(path: Path, results: list[FrameResult], **options: Any) -> None:
-    with ReportWriter(path, a_header(2), **options) as writer:
+def write_all(
+    path: Path, results: list[FrameResult], parts: Sequence[str] = PARTS, **options: Any
+) -> None:
+    with ReportWriter(path, a_header(2, parts=frozenset(parts)), **options) as writer:
         for result in results[writer.n_done :]:
             writer.append(result)
         writer.finish()
@@ -121,6 +164,107 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
             np.testing.assert_array_equal(triangle, contact.triangle)
 
 
+def expected_columns(finding: Finding) -> dict[str, Any]:
+    """Return what the columns beyond the contact's hold of a finding, said once more by hand."""
+    clearance, first = finding.clearance, finding.first_contact
+    response, doubt = finding.response, finding.doubt
+    expected: dict[str, Any] = {
+        "approach_m_s": finding.approach_m_s,
+        "first_contact_s": finding.first_contact_s,
+        "first_contact_uncertainty_s": finding.first_contact_uncertainty_s,
+    }
+    if clearance is not None:
+        expected |= {
+            "clearance_m": (clearance.lower_m, clearance.upper_m),
+            "clearance_on_object_m": clearance.on_object_world,
+            "clearance_on_hull_m": clearance.on_hull_world,
+            "depth_m": (clearance.depth_lower_m, clearance.depth_upper_m),
+        }
+    if first is not None:
+        expected |= {"first_contact_m": first.point_world, "first_contact_status": first.status}
+    if response is not None:
+        expected |= {
+            "cp_obj_m": response.cp_obj_world,
+            "v_rec": response.v_rec,
+            "cp_hull_m": response.cp_hull_world,
+            "n_hull": response.n_hull,
+            "d_rec_m": response.d_rec_m,
+            "response_status": response.status,
+            "cp_hull_paper_m": response.cp_hull_paper_world,
+            "n_hull_paper": response.n_hull_paper,
+            "d_rec_paper_m": response.d_rec_paper_m,
+            "response_status_paper": response.status_paper,
+        }
+    if doubt is not None:
+        expected |= {
+            "clearance_std_m": doubt.std_m,
+            "clearance_at_least_m": doubt.at_least_m,
+            "real_clearance_at_most_m": doubt.real_upper_m,
+            "m_per_px": doubt.mm_per_px,
+            "n_seeing": doubt.n_seeing,
+            "survives": doubt.survives,
+            "hinges_on": ", ".join(doubt.hinges_on),
+            "component": doubt.component,
+        }
+    return expected
+
+
+COLUMNS_OF_CONTACT = {
+    "collides",
+    "n_points",
+    "n_triangles",
+    "certificate",
+    "witness_m",
+    "open_at_m",
+}
+
+
+@_FEW
+@given(results=frame_results())
+def test_every_column_is_read_back_and_what_is_missing_is_nan_nought_or_empty(
+    tmp_path: Path, results: list[FrameResult]
+) -> None:
+    path = tmp_path / "report.h5"
+
+    write_all(path, results, overwrite=True)
+
+    for number, rows in enumerate(read_report(path).objects.values()):
+        for row, result in enumerate(results):
+            expected = {} if result.reason else expected_columns(result.findings[number])
+            for name, values in rows.columns.items():
+                value = values[row]
+                if name in expected:
+                    np.testing.assert_array_equal(value, np.asarray(expected[name]), name)
+                elif name not in COLUMNS_OF_CONTACT:
+                    is_float = np.issubdtype(values.dtype, np.floating)
+                    assert np.isnan(value).all() if is_float else not value, name
+            assert expected.keys() <= rows.columns.keys()
+        assert rows["m_per_px"].shape == (len(results), len(CAMERAS))
+
+
+def test_columns_of_what_was_not_computed_are_absent(tmp_path: Path) -> None:
+    path = tmp_path / "report.h5"
+
+    write_all(path, one_result(), parts=["response"])
+
+    rows = read_report(path).objects["object_0"]
+    assert "d_rec_m" in rows
+    for name in ("clearance_m", "approach_m_s", "first_contact_s", "survives"):
+        assert name not in rows
+    with h5py.File(path) as file:
+        assert "clearance_m" not in file["hybridve/objects/object_0"]
+
+
+def test_a_column_with_a_number_for_each_camera_names_them(tmp_path: Path) -> None:
+    path = tmp_path / "report.h5"
+
+    write_all(path, one_result())
+
+    with h5py.File(path) as file:
+        column = file["hybridve/objects/object_0/m_per_px"]
+        assert tuple(column.attrs["cameras"]) == CAMERAS
+
+
 @_FEW
 @given(results=frame_results(), data=st.data())
 def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
@@ -133,7 +277,7 @@ def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
     write_all(whole, results, overwrite=True)
 
     def write_until_cut_off() -> None:
-        with ReportWriter(resumed, a_header(2)) as writer:
+        with ReportWriter(resumed, a_header(2, parts=frozenset(PARTS))) as writer:
             for result in results[:cut]:
                 writer.append(result)
             raise KeyboardInterrupt
@@ -248,6 +392,7 @@ def test_every_dataset_says_its_unit_and_meaning_and_is_checked(report: Path) ->
         if isinstance(item, h5py.Dataset):
             assert item.attrs["unit"], name
             assert item.attrs["description"], name
+            assert item.attrs["kind"] in get_args(Kind), name
             if item.shape:
                 assert item.compression == "gzip", name
                 assert item.shuffle, name
@@ -257,6 +402,27 @@ def test_every_dataset_says_its_unit_and_meaning_and_is_checked(report: Path) ->
         file["hybridve"].visititems(check)
         assert dict(file.attrs)["format"] == "hybridve-report"
         assert file.attrs["version"] == 1
+
+
+def test_a_report_from_before_a_column_was_known_is_read(report: Path) -> None:
+    with h5py.File(report, "r+") as file:
+        del file["hybridve/frames/stage_s/doubt"]
+        del file["hybridve/objects/object_0/survives"]
+
+    found = read_report(report)
+
+    assert "doubt" not in found.stage_s
+    assert "query" in found.stage_s
+    assert "survives" not in found.objects["object_0"]
+    assert "survives" in found.objects["object_1"]
+
+
+def test_a_report_without_a_column_of_every_report_is_damaged(report: Path) -> None:
+    with h5py.File(report, "r+") as file:
+        del file["hybridve/objects/object_0/certificate"]
+
+    with pytest.raises(ReportError, match="damaged"):
+        read_report(report)
 
 
 def test_another_version_is_refused_by_name(report: Path) -> None:

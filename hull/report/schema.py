@@ -75,7 +75,7 @@ class ReportHeader:
     command : str
         The command line.
     objects : tuple of dict
-        Per object ``name`` and what else is worth keeping, as plain JSON values.
+        Per object ``name`` and what else is worth keeping, as plain JSON values; None is left out.
     settings : dict
         The resolved configuration, as plain JSON values. Two runs with equal settings give equal
         results, so that one can take up the other.

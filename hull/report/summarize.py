@@ -27,6 +27,7 @@ def summarize(report: Report) -> dict[str, Any]:
         ``frames_inside`` besides), the most points and triangles in one frame and ``spans`` of
         clashing frames, each with its first contact and the speed of approach.
 
+        ``closed`` (whether the mesh closes off a volume: whether something is inside can be told).
         Where they were computed, ``clearance``: the smallest one, its bounds, where, when, and what
         it is at least at 95 %; ``depth``: the deepest, bounds and when; ``recovery``: the longest
         D_rec, as published too; ``frames_below_required``: clashing frames and those in which the
@@ -135,6 +136,7 @@ def _about_clearance(
 ) -> dict[str, Any]:
     required_m = float(rows.about.get("required_clearance_m", 0.0))
     found: dict[str, Any] = {
+        "closed": rows.about.get("closed"),
         "required_clearance_m": required_m,
         "frames_below_required": None,
         "frames_perhaps_below_required": None,

@@ -205,8 +205,8 @@ class ReportWriter:
         for number, about in enumerate(header.objects):
             group = objects.create_group(about["name"])
             for name, value in about.items():
-                if name != "name":
-                    group.attrs[name] = value
+                if name != "name" and value is not None:  # HDF5 has no word for nothing
+                    group.attrs[name] = json.dumps(value) if isinstance(value, dict) else value
             for table in tables_of(header.parts):
                 for column in table.columns:
                     self._store(group, column, whole[_object_key(number, column.name)])
