@@ -33,6 +33,10 @@ Pixels make stairs of an outline, and x is the corner of a step; m_k is that of 
 of u (fingertips of a few pixels, holes), the clearance is measured again with the silhouette of
 each of these cameras grown by one pixel all round, which moves straight outlines by 1 to 1.4 px.
 
+Where more cones meet in x than are needed to end the hull there, lambda is not unique: one outline
+alone that moves outward then changes nothing, one that moves inward does. What is told is one of
+the answers, and nearer to the latter.
+
 Where the hull reaches into a closed object, the same holds of the deepest point, with u reversed:
 the signed clearance falls as the depth grows.
 

@@ -1,0 +1,78 @@
+"""Bounds of where the real thing is hold for every ball, and doubts are the same every time."""
+
+from functools import cache
+
+import numpy as np
+from helpers.cones import BOX_FACES, box_vertices, views_from
+from helpers.hulls import ball_masks
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridve.hull.contact.clearance import ClearanceMeter
+from hybridve.hull.contact.components import grown
+from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.uncertainty import Doubter, outline_errors, real_upper
+from hybridve.hull.query.silhouettes import Hull, make_hull
+
+BOX_HALF_M = 0.1
+
+
+@cache
+def meter() -> ClearanceMeter:
+    return ClearanceMeter(
+        box_vertices(np.zeros(3), BOX_HALF_M), BOX_FACES, is_closed=True, tolerance_m=5e-4
+    )
+
+
+@st.composite
+def balls(draw: st.DrawFn) -> tuple[Hull, np.ndarray, float]:
+    """One to three balls beside or in a box, seen by 2 to 5 cameras anywhere; the first's truth."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    n_cameras, n_balls = draw(st.integers(2, 5)), draw(st.integers(1, 3))
+    centers = rng.normal(size=(n_cameras, 3))
+    centers *= rng.uniform(2.0, 3.5, (n_cameras, 1)) / np.linalg.norm(centers, axis=1)[:, None]
+    views = views_from(list(centers), 240, 200, 200.0)
+    masks, nearest_m = [], np.inf
+    for _ in range(n_balls):
+        center, radius_m = rng.uniform(-0.35, 0.35, 3), float(rng.uniform(0.05, 0.15))
+        masks.append(ball_masks(views, center, radius_m))
+        nearest_m = min(nearest_m, float(meter().signed_distance(center[None])[0]) - radius_m)
+    seen = [np.maximum.reduce(of_camera) for of_camera in zip(*masks, strict=True)]
+    return make_hull(views, seen), centers, max(nearest_m, 0.0)
+
+
+@settings(max_examples=200)
+@given(scene=balls())
+def test_the_real_thing_is_not_farther_away_than_the_bound(
+    scene: tuple[Hull, np.ndarray, float],
+) -> None:
+    hull, _, nearest_m = scene
+    clearance = meter().measure(hull)
+
+    bound_m = real_upper(hull, grown(hull), meter(), clearance)
+
+    assert bound_m >= nearest_m - 1e-9
+    assert bound_m >= clearance.lower_m
+    assert np.isfinite(bound_m)
+
+
+@settings(max_examples=25)
+@given(scene=balls())
+def test_a_doubt_does_not_depend_on_what_was_doubted_before(
+    scene: tuple[Hull, np.ndarray, float],
+) -> None:
+    hull, _, _ = scene
+    free = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+    doubter = Doubter(outline_errors(hull.views.names, {}, [0.0] * len(hull.views)))
+    fresh = ClearanceMeter(
+        box_vertices(np.zeros(3), BOX_HALF_M), BOX_FACES, is_closed=True, tolerance_m=5e-4
+    )
+    clearance = fresh.measure(hull)
+
+    first = doubter.frame(hull).doubt(fresh, free, clearance)
+    used = doubter.frame(hull)
+    used.doubt(meter(), free, meter().measure(hull))
+    again = used.doubt(meter(), free, clearance)
+
+    for name in first.__slots__:
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name), err_msg=name)
