@@ -1,16 +1,27 @@
-"""The chart of accuracy against time."""
+"""The charts of accuracy against time, and of clearance against time."""
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.hull.view.chart import Curve, draw_chart, write_chart
+from hybridve.hull.view.chart import (
+    ClearanceCurve,
+    Curve,
+    draw_chart,
+    draw_clearances,
+    write_chart,
+    write_clearances,
+)
 
 U = 4
 
@@ -134,3 +145,115 @@ def test_a_chart_of_times_alone_can_be_drawn(tmp_path: Path) -> None:
     write_chart(tmp_path / "chart.png", [nothing], "accuracy", title="")
 
     assert cv2.imread(str(tmp_path / "chart.png")) is not None
+
+
+N_FRAMES = 8
+
+
+def clearance_curve(name: str = "payload", **changes: Any) -> ClearanceCurve:
+    """Return one that comes near, collides in frames 3 to 5, and was not evaluated in frame 6."""
+    lower_mm = np.array([40.0, 20.0, 5.0, -8.0, -12.0, -3.0, np.nan, 30.0])
+    made = ClearanceCurve(
+        name=name,
+        time_s=np.arange(N_FRAMES) / 10,
+        lower_mm=lower_mm,
+        upper_mm=lower_mm + 2.0,
+        at_least_mm=np.maximum(lower_mm - 4.0, 0.0),
+        clashes=lower_mm < 0,
+        required_mm=10.0,
+        first_contact_s=np.array([0.26]),
+    )
+    return replace(made, **changes)
+
+
+def legend_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def bands_of(figure: Figure, panel: int) -> list[NDArray[np.float64]]:
+    """Return the corners of each filled band, drawn or not."""
+    return [
+        np.concatenate([path.vertices for path in band.get_paths()])
+        for band in figure.axes[panel].collections
+        if isinstance(band, FillBetweenPolyCollection)
+    ]
+
+
+def test_clearances_are_drawn_as_a_band_with_all_that_belongs_to_it() -> None:
+    curve = clearance_curve()
+
+    figure = draw_clearances([curve], title="a report", note="the nearest")
+
+    lines = lines_of(figure, 0)
+    edges = [y for x, y in lines if x == curve.time_s.tolist()]
+    for expected in (curve.lower_mm, curve.upper_mm, curve.at_least_mm):
+        assert any(np.array_equal(edge, expected, equal_nan=True) for edge in edges)
+    assert ([0.26], [0.0]) in lines
+    assert any(y == [10.0, 10.0] for _, y in lines), "the required clearance"
+    bounds, depth = bands_of(figure, 0)
+    assert bounds[:, 1].min() == -12.0
+    assert bounds[:, 1].max() == 42.0
+    # Depth hangs below zero in the colliding frames, and nowhere else.
+    assert (depth[:, 1].min(), depth[:, 1].max()) == (-12.0, 0.0)
+    np.testing.assert_allclose([depth[:, 0].min(), depth[:, 0].max()], [0.3, 0.5])
+    (shade,) = [patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
+    np.testing.assert_allclose([shade.get_x(), shade.get_x() + shade.get_width()], [0.25, 0.55])
+    names = ["bounds", "at least, at 95 % (estimate)", "required", "first contact (estimate)"]
+    assert sorted(legend_of(figure)) == sorted([*names, "collides"])
+    assert figure.get_suptitle() == "a report\nthe nearest"
+
+
+def test_what_an_object_has_not_is_not_drawn() -> None:
+    plain = clearance_curve(
+        lower_mm=np.full(N_FRAMES, 30.0),
+        upper_mm=np.full(N_FRAMES, np.inf),
+        at_least_mm=np.full(N_FRAMES, np.nan),
+        clashes=np.zeros(N_FRAMES, np.bool_),
+        required_mm=0.0,
+        first_contact_s=np.zeros(0),
+    )
+
+    figure = draw_clearances([plain], title="")
+
+    assert legend_of(figure) == ["bounds"]
+    assert not figure.axes[0].patches
+    assert np.isfinite(figure.axes[0].get_ylim()).all()
+
+
+def test_every_object_has_a_panel_and_the_picture_shows_collisions(tmp_path: Path) -> None:
+    path = tmp_path / "curves.png"
+    curves = [clearance_curve("payload"), clearance_curve("bracket", clashes=np.zeros(8, np.bool_))]
+
+    write_clearances(path, curves, title="a report")
+
+    titles = [axes.get_title("left") for axes in draw_clearances(curves, title="").axes]
+    assert titles == ["payload", "bracket"]
+    image = cv2.imread(str(path))
+    assert image is not None
+    rgb = image[..., ::-1].astype(int)
+    # The shade of a collision: its colour at 15 % over white.
+    shade = np.round(255 * (0.15 * np.array(to_rgb("#D55E00")) + 0.85))
+    is_shaded = (np.abs(rgb - shade).max(axis=-1) < 4).mean(axis=1)
+    half = len(is_shaded) // 2
+    assert is_shaded[:half].max() > 0.3
+    assert is_shaded[half:].max() < 0.1, "only the first object collides; the legend has a patch"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_one_frame_alone_can_be_drawn(tmp_path: Path) -> None:
+    one = clearance_curve(
+        time_s=np.zeros(1),
+        lower_mm=np.array([-3.0]),
+        upper_mm=np.array([-2.0]),
+        at_least_mm=np.zeros(1),
+        clashes=np.array([True]),
+    )
+
+    write_clearances(tmp_path / "one.svg", [one], title="")
+
+    assert (tmp_path / "one.svg").read_bytes()[:5] == b"<?xml"
+
+
+def test_curves_of_other_endings_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"charts are \.png, \.svg, \.pdf"):
+        write_clearances(tmp_path / "curves.gif", [clearance_curve()], title="")
