@@ -20,6 +20,14 @@ SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 TWO_TRIANGLES = [[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]]
 
 
+PLY = (
+    "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 3\nproperty float x\n"
+    "property float y\nproperty float z\nelement face 2\n"
+    "property list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0.25\n0 1 0\n3 0 1 2\n3 0 2 1\n"
+)
+
+
 def write(path: Path, content: str | bytes) -> Path:
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
@@ -115,6 +123,14 @@ def test_an_stl_is_one_part_in_the_files_order(tmp_path: Path) -> None:
     assert len(read_cad(text).parts) == 1
     np.testing.assert_array_equal(corners(binary), triangles.astype(np.float32))
     np.testing.assert_array_equal(corners(text), triangles)
+
+
+def test_ply_and_off_give_their_triangles_in_the_files_order(tmp_path: Path) -> None:
+    expected = [[[0, 0, 0], [1, 0, 0.25], [0, 1, 0]], [[0, 0, 0], [0, 1, 0], [1, 0, 0.25]]]
+    off = "0 0 0\n1 0 0.25\n0 1 0\n3 0 1 2\n3 0 2 1\n"
+
+    for name, text in (("a.ply", PLY), ("a.off", f"OFF\n# hi\n3 2 0\n{off}")):
+        assert corners(write(tmp_path / name, text)).tolist() == expected
 
 
 # --- glTF -------------------------------------------------------------------------------------
@@ -616,7 +632,11 @@ def test_an_empty_mesh_is_refused(tmp_path: Path, content: str, suffix: str) -> 
         ("a.off", "", "cannot be read"),
         ("a.ply", "", "cannot be read"),
         ("a.ply", "ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "cannot be read"),
-        ("a.stl", binary_stl(np.ones((9, 3, 3)))[:-60], "mesh is empty"),
+        ("a.ply", PLY[: PLY.rindex("3 0")], "cut off: 4 of 5 lines"),
+        ("a.off", "OFF 3 2 0\n0 0 0\n1 0 0\n0 1 0 # last\n\n3 0 1 2\n", "cut off: 4 of 5 lines"),
+        ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut off: 4 of 5 lines"),
+        ("a.stl", binary_stl(np.ones((9, 3, 3)))[:-60], "474 bytes, where its header promises 534"),
+        ("a.stl", binary_stl(np.ones((9, 3, 3))) + b"12", "536 bytes, where .* promises 534"),
         ("a.stl", ascii_stl(np.ones((9, 3, 3)), "a").replace("1.0", "1.x", 9), "cannot be read"),
         ("a.glb", b"glTF", "cut off"),
         ("a.glb", square_gltf().glb()[:-40], "cut off: [0-9]+ of [0-9]+ bytes"),
@@ -639,14 +659,8 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(
 
 
 def test_a_mesh_with_a_coordinate_that_is_no_number_is_refused(tmp_path: Path) -> None:
-    text = (
-        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
-        "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-        "0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n"
-    )
-
     with pytest.raises(SceneError, match=r"vertex 1 is .* not finite numbers"):
-        read_cad(write(tmp_path / "broken.ply", text))
+        read_cad(write(tmp_path / "broken.ply", PLY.replace("0.25", "nan")))
 
 
 def test_a_face_without_its_vertex_is_refused() -> None:

@@ -20,6 +20,7 @@ trimesh 5.2 on 31 files: binary STL and PLY the same to the bit in the same orde
 rounded to single precision (to 24 nm); OBJ with relative indices or polygons not read at all.
 """
 
+import dataclasses
 import io
 import re
 import subprocess
@@ -147,6 +148,7 @@ def reader_version(kind: str) -> str | None:
 def _parse_with_trimesh(content: bytes, kind: str) -> Contents:
     import trimesh  # late: half a second
 
+    _refuse_what_is_cut_off(content, kind)
     with warnings.catch_warnings():
         # NumPy's word for a text whose numbers end early; the rest would be left out in silence.
         warnings.simplefilter("error", DeprecationWarning)
@@ -162,6 +164,30 @@ def _parse_with_trimesh(content: bytes, kind: str) -> Contents:
         if hasattr(mesh, "faces")  # the rest are points and curves
     ]
     return Contents((Part("", *join_meshes(meshes)),) if meshes else ())
+
+
+def _refuse_what_is_cut_off(content: bytes, kind: str) -> None:
+    """Refuse files that hold less than they promise; trimesh takes what is there, or nothing."""
+    if kind == "STL":
+        if b"\0" in content[:84] and len(content) >= 84:  # not text
+            expected = 84 + 50 * int.from_bytes(content[80:84], "little")
+            if len(content) != expected:
+                raise ValueError(f"{len(content)} bytes, where its header promises {expected}")
+        return
+    lines = [
+        line for line in (raw.partition(b"#")[0].split() for raw in content.splitlines()) if line
+    ]
+    if kind == "PLY":
+        if [b"format", b"ascii"] not in [line[:2] for line in lines[:2]]:
+            return  # of numbers that are not text, trimesh knows how many there must be
+        head = next((n for n, line in enumerate(lines) if line == [b"end_header"]), 0)
+        promised = [line[2] for line in lines[:head] if line[0] == b"element" and len(line) == 3]
+    else:
+        head = 0 if lines and len(lines[0]) > 1 else 1  # the numbers may stand behind the word OFF
+        promised = [word for word in lines[head] if word.isdigit()][:2] if len(lines) > head else []
+    there, expected = len(lines) - head - 1, sum(int(number) for number in promised)
+    if there < expected:
+        raise ValueError(f"the file is cut off: {there} of {expected} lines are there")
 
 
 def _parse_fbx(path: Path) -> Contents:
@@ -203,7 +229,9 @@ def _parse_step(content: bytes, tessellation_m: float) -> Contents:
     if done.returncode != 0 or not converted:
         raise ValueError(f"OpenCASCADE says: {_complaint(done.stdout + done.stderr)}")
     contents = parse_gltf(converted, {}, name_by_mesh=True)
-    return Contents(contents.parts, "of the file", 1.0, "z")
+    # Colours come as materials without names, which the conversion numbers.
+    parts = tuple(dataclasses.replace(part, material="") for part in contents.parts)
+    return Contents(parts, "of the file", 1.0, "z")
 
 
 def _complaint(talk: str) -> str:
