@@ -142,6 +142,7 @@ def test_a_file_of_several_parts_becomes_as_many_objects(folder: Path) -> None:
 
     assert (a.name, b.name, whole.name) == ("part.a", "part.b", "part")
     assert (a.about["part"], b.about["part"], whole.about["part"]) == ("a", "b", None)
+    assert {thing.about["object"] for thing in (a, b, whole)} == {"part"}
     for thing in (a, b, whole):
         assert thing.required_clearance_m == 0.007
         assert thing.recovery_direction is not None
@@ -163,6 +164,7 @@ def test_what_the_report_is_told_of_an_object_is_exact(folder: Path) -> None:
     assert json.loads(json.dumps(about)) == about
     assert about.pop("volume_m3") == pytest.approx(1 / 6, rel=1e-12)
     assert about == {
+        "object": "part",
         "mesh": "part.obj",
         "format": "OBJ",
         "part": None,

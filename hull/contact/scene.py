@@ -163,8 +163,9 @@ def load_scene(path: Path) -> Scene:
     An object's file is turned z up, scaled by its unit, turned by `rotate_deg` about x, then y,
     then z of the world, and moved by `translate_mm`.
 
-    Each object's `about` holds: ``mesh`` (as the scene names it), ``format``, ``part`` (the name in
-    the file; None for a file of one part, or merged), ``unit`` (as the scene or the file names it),
+    Each object's `about` holds: ``object`` (the name of its table, which parts of one file share),
+    ``mesh`` (as the scene names it), ``format``, ``part`` (what the object is called after that
+    name; None for a file of one part, or merged), ``unit`` (as the scene or the file names it),
     ``unit_m`` (metres), ``up`` (the axis that was turned up), ``tessellation_m`` (largest distance
     of a triangle from the surface it stands for; None if the file is made of triangles),
     ``n_triangles``, ``n_vertices``, ``n_zero_area``, ``n_open_edges``, ``n_nonmanifold_edges``,
@@ -281,6 +282,7 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             used = vertices_world[part.faces.ravel()]
             reference_point_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
         about = {
+            "object": entry.name,
             "mesh": entry.mesh,
             "format": cad.kind,
             "part": name if is_assembly else None,
