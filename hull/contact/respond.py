@@ -44,9 +44,9 @@ from hybridve.hull.query.walk import (
 
 #: What is wrong with an exact answer. "": nothing. "no direction": CP_obj lies at RP_obj; no vector
 #: is known. "no exit": V_rec is in the hull up to `ResponseSettings.reach_m`. "outside": CP_obj is
-#: not in the hull in double precision, and V_rec does not enter it below the height: there is
-#: nothing to recover from, D_rec is 0, CP_hull is CP_obj, and only N_hull is unknown. "no normal":
-#: the silhouette has no direction at CP_hull.
+#: outside the hull in double precision, or on its very rim, and V_rec does not enter it below the
+#: height: there is nothing to recover from, D_rec is 0, CP_hull is CP_obj, and only N_hull is
+#: unknown. "no normal": the silhouette has no direction at CP_hull, or one that points back.
 Status = Literal["", "no direction", "no exit", "outside", "no normal"]
 
 #: The same of an answer as published. "base inside": so is the middle of BC, and nothing is known.
