@@ -609,6 +609,60 @@ def test_a_damaged_step_file_is_refused_without_talk_on_stdout(
     assert capfd.readouterr() == ("", "")
 
 
+# --- FBX --------------------------------------------------------------------------------------
+
+FBX = """; FBX 7.3.0 project file
+FBXHeaderExtension:  {
+	FBXHeaderVersion: 1003
+	FBXVersion: 7300
+}
+GlobalSettings:  {
+	Version: 1000
+	Properties70:  {
+		P: "UpAxis", "int", "Integer", "",2
+		P: "UpAxisSign", "int", "Integer", "",1
+		P: "FrontAxis", "int", "Integer", "",1
+		P: "FrontAxisSign", "int", "Integer", "",-1
+		P: "CoordAxis", "int", "Integer", "",0
+		P: "CoordAxisSign", "int", "Integer", "",1
+	}
+}
+Objects:  {
+	Geometry: 1001, "Geometry::Box", "Mesh" {
+		Vertices: *12 {
+			a: 0,0,0,1,0,0,0,1,0,0,0,1
+		}
+		PolygonVertexIndex: *12 {
+			a: 0,2,-2,0,1,-4,0,3,-3,1,2,-4
+		}
+		GeometryVersion: 124
+	}
+	Model: 2001, "Model::Box", "Mesh" {
+		Version: 232
+		Properties70:  {
+			P: "Lcl Translation", "Lcl Translation", "", "A",10,20,30
+		}
+	}
+}
+Connections:  {
+	C: "OO",2001,0
+	C: "OO",1001,2001
+}
+"""
+
+
+def test_an_fbx_stands_as_it_was_drawn(tmp_path: Path) -> None:
+    write(tmp_path / "part.fbx", FBX)  # z up
+
+    (thing,) = scene_of(tmp_path, 'mesh = "part.fbx"\nunit = "m"\n').objects
+
+    np.testing.assert_allclose(thing.box_world, [(10, 20, 30), (11, 21, 31)], atol=1e-5)
+    assert thing.is_closed
+    assert thing.about["inside_out"] is False
+    with pytest.raises(SceneError, match=r"object\.1\.unit: .*FBX files do not say"):
+        scene_of(tmp_path, 'mesh = "part.fbx"\n')
+
+
 # --- what holds for all -----------------------------------------------------------------------
 
 
