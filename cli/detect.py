@@ -309,7 +309,8 @@ def _print_comparison(table: Path, comparison: dict[str, Any]) -> None:
     for row in comparison["rows"]:
         cells = (_cell_text(row["sessions"].get(name)) for name in sessions)
         rows.append((row["layout"], row["object"], *cells))
-    click.echo(f"{table}: {len(sessions)} sessions, {len(comparison['layouts'])} layouts")
+    layouts = options.counted(len(comparison["layouts"]), "layout")
+    click.echo(f"{table}: {options.counted(len(sessions), 'session')}, {layouts}")
     options.print_table(rows)
 
 
@@ -325,6 +326,6 @@ def _cell_text(cell: dict[str, Any] | None) -> str:
     elif cell["clearance_lower_m"] is not None:
         parts.append(f"{1e3 * cell['clearance_lower_m']:.1f} mm")
     if cell["required_clearance_m"] and cell["frames_below_required"]:
-        below = f"{1e3 * cell['required_clearance_m']:.3g} mm"
-        parts.append(f"{cell['frames_below_required']} frames below {below}")
+        below = f"{1e3 * cell['required_clearance_m']:g} mm"
+        parts.append(f"{options.counted(cell['frames_below_required'], 'frame')} below {below}")
     return ", ".join(parts)

@@ -14,6 +14,7 @@ from hybridve.cli.detect import detect
 from hybridve.cli.doctor import doctor
 from hybridve.cli.render import render
 from hybridve.cli.segment import segment
+from hybridve.cli.spacing import spacing
 from hybridve.cli.summary import summary
 from hybridve.cli.sweep import sweep
 from hybridve.cli.synth import synth
@@ -54,7 +55,7 @@ def cli(verbose: int, quiet: bool) -> None:
     )
 
 
-for command in (demo, synth, calibrate, segment, detect, sweep, summary, render, doctor):
+for command in (demo, synth, calibrate, segment, detect, spacing, sweep, summary, render, doctor):
     cli.add_command(command)
 
 for command in (cli, *cli.commands.values()):

@@ -233,6 +233,11 @@ def evaluation_of(
     )
 
 
+def counted(count: int, what: str) -> str:
+    """Return "1 frame", "2 frames"."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def print_table(rows: Sequence[Sequence[str]]) -> None:
     """Print rows of cells in columns, indented; the first row is the heading."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

@@ -70,7 +70,8 @@ def print_summary(report: "Report") -> None:
     numbers = summarize(report)
     click.echo(f"{numbers['report']}: {numbers['frames']} frames, {numbers['seconds']:.2f} s")
     if numbers["frames_invalid"]:
-        click.echo(f"  {numbers['frames_invalid']} frames could not be evaluated:")
+        invalid = options.counted(numbers["frames_invalid"], "frame")
+        click.echo(f"  {invalid} could not be evaluated:")
         for reason, count in numbers["reasons"].items():
             click.echo(f"    {count} x {reason}")
     rows = [("object", "verdict", "frames", "certain", "when", "points, most", "triangles, most")]
@@ -168,28 +169,23 @@ def _print_entries(found: dict[str, Any]) -> None:
 
 def _warnings(found: dict[str, Any]) -> list[str]:
     """Return what a reader must know before trusting an object's rows."""
-    lines = []
-    if missed := found["frames_colliding"] - found["frames_sampled_colliding"]:
-        lines.append(
-            f"in {_frames(missed)} no sample collides, but a certified point does; "
-            "--viewport or --accuracy-mm finds more points"
-        )
-    if found["frames_inside"]:
-        lines.append(
-            f"in {_frames(found['frames_inside'])} something is wholly inside, without touching "
-            "the surface"
-        )
-    if found["frames_hinging"]:
-        lines.append(
-            f"in {_frames(found['frames_hinging'])} the verdict hinges on a single camera: "
-            + ", ".join(found["hinges_on"])
-        )
-    if found["frames_unsure"]:
-        lines.append(
-            f"in {_frames(found['frames_unsure'])} what touches may hold nothing real: other "
-            "volumes of the hull explain all its pixels"
-        )
-    return lines
+    told = (
+        (
+            found["frames_colliding"] - found["frames_sampled_colliding"],
+            "no sample collides, but a certified point does; --viewport or --accuracy-mm finds "
+            "more points",
+        ),
+        (found["frames_inside"], "something is wholly inside, without touching the surface"),
+        (
+            found["frames_hinging"],
+            f"the verdict hinges on a single camera: {', '.join(found['hinges_on'])}",
+        ),
+        (
+            found["frames_unsure"],
+            "what touches may hold nothing real: other volumes of the hull explain all its pixels",
+        ),
+    )
+    return [f"in {options.counted(count, 'frame')} {text}" for count, text in told if count]
 
 
 def _speed_text(lower_m_s: float | None, upper_m_s: float | None) -> str:
@@ -200,10 +196,6 @@ def _speed_text(lower_m_s: float | None, upper_m_s: float | None) -> str:
         return f", coming at {lower_m_s:.2f} m/s or more"
     lower, upper = f"{lower_m_s:.2f}", f"{upper_m_s:.2f}"
     return f", coming at {lower} m/s" if lower == upper else f", coming at {lower}-{upper} m/s"
-
-
-def _frames(count: int) -> str:
-    return "1 frame" if count == 1 else f"{count} frames"
 
 
 def _mm(length_m: float) -> str:

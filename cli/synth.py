@@ -21,27 +21,53 @@ from hybridve.cli.progress import StageProgress
 @click.option(
     "--n-frames", type=click.IntRange(1), help="Length of the recording; the preset's by default."
 )
+@click.option(
+    "--participant",
+    type=int,
+    help="payload: whose hands, 1 to 4; the first uses no tool. Default: 1.",
+)
+@click.option(
+    "--gap-mm",
+    type=float,
+    help="payload: how far payload_a hangs above the PMT. Default: 150.",
+)
 @options.overwrite_option
 @options.quiet_progress
 def synth(
-    preset: str, output: Path, seed: int, n_frames: int | None, overwrite: bool, progress: bool
+    preset: str,
+    output: Path,
+    seed: int,
+    n_frames: int | None,
+    participant: int | None,
+    gap_mm: float | None,
+    overwrite: bool,
+    progress: bool,
 ) -> None:
     r"""Generate a recording of simple things moving through CAD, with the truth beside it.
 
-    PRESET is one of: boxes. The folder gets a session.toml, a scene.toml, the cameras' pictures of
-    the board, of the empty scene and of the task, meshes, and truth.h5.
+    The folder gets a session.toml, a scene.toml, the cameras' pictures of the board, of the empty
+    scene and of the task, meshes, and truth.h5. PRESET is one of:
 
     \b
-    Example:
+      boxes    an arm, a ball and a carton among four parts
+      payload  a pipe and a cord between two payloads: how much room do they need?
+      ball     blocks about a virtual ball
+      curtain  a hand through a curtain in a window
+
+    \b
+    Examples:
       hybridve synth boxes -o my_session
+      hybridve synth payload -o with_tongs --participant 2 --gap-mm 150
     """
     from hybridve.hull.capture.synth import write_session
 
+    chosen = (("participant", participant), ("gap_mm", gap_mm))
     write_session(
         preset,
         output,
         seed=seed,
         n_frames=n_frames,
+        options={name: value for name, value in chosen if value is not None},
         overwrite=overwrite,
         progress=StageProgress(enabled=progress),
     )

@@ -63,30 +63,29 @@ def distinct_names(paths: Sequence[Path], default: str) -> list[str]:
     >>> distinct_names([Path("/a/x.toml"), Path("/b/x.toml")], "session.toml")
     ['a-x', 'b-x']
     """
-    parts = [_parts_of(path, default) for path in paths]
-    for number, one in enumerate(parts):
-        if one in parts[:number]:
+    files = [_file_of(path, default) for path in paths]
+    for number, file in enumerate(files):
+        if file in files[:number]:
             raise ValueError(f"{paths[number]} is given twice")
+    parts = [
+        (file.parent if file.name == default else file.with_suffix("")).parts for file in files
+    ]
     for length in range(1, max(len(one) for one in parts) + 1):
         names = [_file_name("-".join(one[-length:])) for one in parts]
         # Some file systems take capitals for small letters.
         if len({name.casefold() for name in names}) == len(names):
             return names
-    # Paths that differ only in what a name cannot hold.
+    # They differ only in what a name cannot hold, or are a.toml and a/scene.toml.
     return [f"{number}-{name}" for number, name in enumerate(names, start=1)]
 
 
-def _parts_of(path: Path, default: str) -> tuple[str, ...]:
+def _file_of(path: Path, default: str) -> Path:
     path = path.resolve()
-    if path.name == default:
-        path = path.parent
-    elif path.suffix == ".toml":
-        path = path.with_suffix("")
-    return path.parts
+    return path if path.suffix == ".toml" else path / default
 
 
 def _file_name(text: str) -> str:
-    return re.sub(r"_+", "_", re.sub(r"[^\w.-]", "_", text)).strip("_") or "_"
+    return re.sub(r"_+", "_", re.sub(r"[^\w.-]", "_", text)).strip("_") or "-"
 
 
 @dataclass(frozen=True, slots=True)

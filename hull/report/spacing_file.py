@@ -1,0 +1,451 @@
+"""``SPACING.h5``: how much room a task needs, written complete or not at all, read back by version.
+
+::
+
+    /                            attrs: format, version, created_utc, command, machine, versions
+    /settings                    the resolved configuration, JSON
+    /sessions/NAME/              attrs: the answer; settings: what was recorded, JSON
+    /sessions/NAME/curve/        how many frames violate at each shift
+    /sessions/NAME/frames/       per frame: which shifts violate, which are undecided
+    /sessions/NAME/free          stretches of shifts at which no frame violates
+    /sessions/NAME/standing/     per object that was not moved: how many frames violate it anyway
+
+Stretches of shifts of all frames stand one below the other; those of frame k are the rows
+``offset[k]`` to ``offset[k + 1]``.
+"""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import ReportError
+
+FORMAT = "hybridve-spacing"
+VERSION = 1
+
+_STORED = {
+    "compression": "gzip",
+    "compression_opts": 1,
+    "shuffle": True,
+    "fletcher32": True,
+    "track_times": False,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretches:
+    """Stretches of shifts, some for each of F frames.
+
+    Attributes
+    ----------
+    offset : (F + 1,) int64
+        Where those of each frame begin.
+    shift_m : (K, 2) float64
+        Begin and end, metres.
+    """
+
+    offset: NDArray[np.int64]
+    shift_m: NDArray[np.float64]
+
+    def of(self, frame: int) -> NDArray[np.float64]:
+        """Return those of one frame, (N, 2) metres."""
+        return self.shift_m[self.offset[frame] : self.offset[frame + 1]]
+
+
+def make_stretches(of_frames: list[NDArray[np.float64]]) -> Stretches:
+    """Return the stretches (N, 2) of each frame as one."""
+    offset = np.cumsum([0, *(len(one) for one in of_frames)]).astype(np.int64)
+    return Stretches(offset, np.concatenate([np.zeros((0, 2)), *of_frames]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpacingFrames:
+    """The F frames of a recording.
+
+    Attributes
+    ----------
+    index : (F,) uint32
+        Their numbers in the session.
+    time_s : (F,) float64
+        When they were recorded.
+    reason : tuple of str
+        Why a frame could not be evaluated; else empty.
+    violated, undecided : Stretches
+        Shifts that certainly violate a clearance, and those of which nothing is known.
+    n_measured : (F,) uint32
+        Measurements of an object in a place.
+    measure_s : (F,) float64
+        Seconds they took.
+    """
+
+    index: NDArray[np.uint32]
+    time_s: NDArray[np.float64]
+    reason: tuple[str, ...]
+    violated: Stretches
+    undecided: Stretches
+    n_measured: NDArray[np.uint32]
+    measure_s: NDArray[np.float64]
+
+    @property
+    def n_valid(self) -> int:
+        """How many frames were evaluated."""
+        return sum(not reason for reason in self.reason)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpacingCurve:
+    """How many frames violate at each of S shifts.
+
+    Attributes
+    ----------
+    shift_m : (S,) float64
+        Ascending, metres.
+    violated, undecided : (S,) uint32
+        Frames that certainly violate, and those of which that is not known.
+    """
+
+    shift_m: NDArray[np.float64]
+    violated: NDArray[np.uint32]
+    undecided: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Binding:
+    """The frame that decides how far objects must be moved, and where.
+
+    Attributes
+    ----------
+    frame : int
+        Its number in the session.
+    time_s : float
+        When it was recorded.
+    object_name : str
+        The moved object that it comes nearest to.
+    shift_m : float
+        The shift at which the rest was measured.
+    on_hull_world, on_object_world : (3,) float64
+        The point of the hull and that of the moved object, metres, between which the upper bound
+        was measured.
+    clearance_m : (2,) float64
+        Bounds of the clearance there, less the depth where the hull is in the object, metres.
+    required_m : float
+        The clearance that the object requires.
+    """
+
+    frame: int
+    time_s: float
+    object_name: str
+    shift_m: float
+    on_hull_world: NDArray[np.float64]
+    on_object_world: NDArray[np.float64]
+    clearance_m: NDArray[np.float64]
+    required_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionSpacing:
+    """How much room the task of one recording needs.
+
+    Attributes
+    ----------
+    name : str
+        The session, unique within the file.
+    settings : dict
+        What was recorded, as plain JSON values.
+    shift_m : float
+        The smallest shift that is proved to keep every clearance in every frame; NaN if none in
+        the range is.
+    at_least_m : float
+        The smallest shift that truly does is not below this; NaN if none in the range does.
+    binding : Binding or None
+        What keeps it from being smaller; if none is free, what is worst at the end of the range.
+        None where the begin of the range is free.
+    free_m : (N, 2) float64
+        Stretches of the range that are proved to keep every clearance, metres.
+    curve : SpacingCurve
+        How many frames violate.
+    at_zero : (2,) int64, or None
+        Frames that violate at shift 0, and those undecided there; None if it is not in the range.
+    frames : SpacingFrames
+        What each frame says.
+    standing : dict of str to (int, int)
+        Per object that was not moved how many frames violate its clearance, and how many may.
+    """
+
+    name: str
+    settings: dict[str, Any]
+    shift_m: float
+    at_least_m: float
+    binding: Binding | None
+    free_m: NDArray[np.float64]
+    curve: SpacingCurve
+    at_zero: tuple[int, int] | None
+    frames: SpacingFrames
+    standing: dict[str, tuple[int, int]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spacing:
+    """How much room a task needs, as several recordings of it say.
+
+    Attributes
+    ----------
+    command, machine, created_utc : str
+        As in a report.
+    versions, settings : dict
+        As in a report; the settings say what was moved, whereto and how far.
+    sessions : tuple of SessionSpacing
+        At least one.
+    """
+
+    command: str
+    machine: str
+    created_utc: str
+    versions: dict[str, str]
+    settings: dict[str, Any]
+    sessions: tuple[SessionSpacing, ...]
+
+
+def write_spacing(path: Path, spacing: Spacing) -> None:
+    """Write a spacing; the file appears only when it is complete.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    """
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with h5py.File(partial, "w") as file:
+            _write(file, spacing)
+        partial.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_spacing(path: Path) -> Spacing:
+    """Return what a spacing file holds.
+
+    Raises
+    ------
+    ReportError
+        If there is no such file, it is not a spacing, of an unknown version, or damaged.
+    """
+    if not path.is_file():
+        raise ReportError(f"{path}: there is no such spacing")
+    try:
+        with h5py.File(path, "r") as file:
+            found = file.attrs.get("format", "an unknown format")
+            if found != FORMAT:
+                raise ReportError(f"{path}: holds {found}, expected {FORMAT}")
+            version = int(file.attrs["version"])
+            if version != VERSION:
+                raise ReportError(
+                    f"{path}: spacing version {version}, this hybridve reads {VERSION}; "
+                    "use the version that wrote it"
+                )
+            return _read(file)
+    except (OSError, KeyError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise ReportError(f"{path}: not a readable spacing, or damaged: {text}") from error
+
+
+def _write(file: h5py.File, spacing: Spacing) -> None:
+    file.attrs["format"] = FORMAT
+    file.attrs["version"] = VERSION
+    file.attrs["created_utc"] = spacing.created_utc
+    file.attrs["command"] = spacing.command
+    file.attrs["machine"] = spacing.machine
+    file.attrs["versions"] = json.dumps(spacing.versions)
+    _store_text(file, "settings", json.dumps(spacing.settings), "the resolved configuration, JSON")
+    sessions = file.create_group("sessions", track_order=True)
+    for one in spacing.sessions:
+        _write_session(sessions.create_group(one.name), one)
+
+
+def _write_session(group: h5py.Group, one: SessionSpacing) -> None:
+    group.attrs["shift_m"] = one.shift_m
+    group.attrs["at_least_m"] = one.at_least_m
+    if one.at_zero is not None:
+        group.attrs["at_zero"] = one.at_zero
+    if one.binding is not None:
+        binding = group.create_group("binding")
+        for name in _BINDING:
+            binding.attrs[name] = getattr(one.binding, name)
+    _store_text(group, "settings", json.dumps(one.settings), "what was recorded, JSON")
+    _store(group, "free", one.free_m, "m", "shifts at which every clearance is proved to be kept")
+    curve = group.create_group("curve")
+    _store(curve, "shift_m", one.curve.shift_m, "m", "how far the objects are moved")
+    _store(curve, "violated", one.curve.violated, "1", "frames that certainly violate a clearance")
+    _store(curve, "undecided", one.curve.undecided, "1", "frames of which that is not known")
+    frames = group.create_group("frames")
+    _store(frames, "index", one.frames.index, "1", "number of the frame in the session")
+    _store(frames, "time_s", one.frames.time_s, "s", "time since the recording began")
+    _store_text(frames, "reason", list(one.frames.reason), "why a frame could not be evaluated")
+    _store(frames, "n_measured", one.frames.n_measured, "1", "measurements of an object in a place")
+    _store(frames, "measure_s", one.frames.measure_s, "s", "how long they took")
+    for name, what in (("violated", "certainly violate"), ("undecided", "may violate")):
+        stretches: Stretches = getattr(one.frames, name)
+        below = frames.create_group(name)
+        _store(below, "offset", stretches.offset, "1", "where the rows of each frame begin")
+        _store(below, "shift_m", stretches.shift_m, "m", f"begin and end of shifts that {what}")
+    standing = group.create_group("standing", track_order=True)
+    for name, counts in one.standing.items():
+        standing.attrs[name] = counts
+
+
+#: What is kept of a binding frame, each as an attribute.
+_BINDING = (
+    "frame",
+    "time_s",
+    "object_name",
+    "shift_m",
+    "on_hull_world",
+    "on_object_world",
+    "clearance_m",
+    "required_m",
+)
+
+
+def _read(file: h5py.File) -> Spacing:
+    return Spacing(
+        command=file.attrs["command"],
+        machine=file.attrs["machine"],
+        created_utc=file.attrs["created_utc"],
+        versions=json.loads(file.attrs["versions"]),
+        settings=json.loads(file["settings"].asstr()[()]),
+        sessions=tuple(_read_session(name, group) for name, group in file["sessions"].items()),
+    )
+
+
+def _read_session(name: str, group: h5py.Group) -> SessionSpacing:
+    frames, curve = group["frames"], group["curve"]
+    binding = None
+    if "binding" in group:
+        found = {key: group["binding"].attrs[key] for key in _BINDING}
+        binding = Binding(
+            **{
+                key: value.item() if value.ndim == 0 else value
+                for key, value in found.items()
+                if key != "object_name"
+            },
+            object_name=found["object_name"],
+        )
+    return SessionSpacing(
+        name=name,
+        settings=json.loads(group["settings"].asstr()[()]),
+        shift_m=float(group.attrs["shift_m"]),
+        at_least_m=float(group.attrs["at_least_m"]),
+        binding=binding,
+        free_m=group["free"][()],
+        curve=SpacingCurve(curve["shift_m"][()], curve["violated"][()], curve["undecided"][()]),
+        at_zero=_pair(group.attrs["at_zero"]) if "at_zero" in group.attrs else None,
+        frames=SpacingFrames(
+            index=frames["index"][()],
+            time_s=frames["time_s"][()],
+            reason=tuple(frames["reason"].asstr()[()].tolist()),
+            violated=_read_stretches(frames["violated"]),
+            undecided=_read_stretches(frames["undecided"]),
+            n_measured=frames["n_measured"][()],
+            measure_s=frames["measure_s"][()],
+        ),
+        standing={key: _pair(counts) for key, counts in group["standing"].attrs.items()},
+    )
+
+
+def _read_stretches(group: h5py.Group) -> Stretches:
+    return Stretches(group["offset"][()], group["shift_m"][()])
+
+
+def _pair(counts: NDArray[np.int64]) -> tuple[int, int]:
+    first, second = counts.tolist()
+    return first, second
+
+
+def _store(group: h5py.Group, name: str, values: NDArray[Any], unit: str, description: str) -> None:
+    dataset = group.create_dataset(name, data=values, chunks=True, **_STORED)
+    dataset.attrs["unit"] = unit
+    dataset.attrs["description"] = description
+
+
+def _store_text(group: h5py.Group, name: str, text: str | list[str], description: str) -> None:
+    dataset = group.create_dataset(name, data=text, dtype=h5py.string_dtype(), track_times=False)
+    dataset.attrs["unit"] = "1"
+    dataset.attrs["description"] = description
+
+
+def spacing_as_dict(spacing: Spacing) -> dict[str, Any]:
+    """Return what a spacing found, as plain JSON values; numbers that are not there are None."""
+    return {
+        "command": spacing.command,
+        "machine": spacing.machine,
+        "created_utc": spacing.created_utc,
+        "settings": spacing.settings,
+        "sessions": [_session_as_dict(one) for one in spacing.sessions],
+    }
+
+
+def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
+    frames, curve, binding = one.frames, one.curve, one.binding
+    return {
+        "name": one.name,
+        "settings": one.settings,
+        "shift_m": _number(one.shift_m),
+        "at_least_m": _number(one.at_least_m),
+        "binding": None
+        if binding is None
+        else {
+            "frame": binding.frame,
+            "time_s": binding.time_s,
+            "object": binding.object_name,
+            "shift_m": binding.shift_m,
+            "on_hull_m": _numbers(binding.on_hull_world),
+            "on_object_m": _numbers(binding.on_object_world),
+            "clearance_m": _numbers(binding.clearance_m),
+            "required_clearance_m": binding.required_m,
+        },
+        "free_m": one.free_m.tolist(),
+        "frames": len(frames.index),
+        "frames_evaluated": frames.n_valid,
+        "violated_at_start": int(curve.violated[0]),
+        "violated_at_zero": None if one.at_zero is None else one.at_zero[0],
+        "undecided_at_zero": None if one.at_zero is None else one.at_zero[1],
+        "curve": {
+            "shift_m": curve.shift_m.tolist(),
+            "violated": curve.violated.tolist(),
+            "undecided": curve.undecided.tolist(),
+        },
+        "standing": {
+            name: {"violated": violated, "undecided": undecided}
+            for name, (violated, undecided) in one.standing.items()
+        },
+        "measurements": int(frames.n_measured.sum()),
+        "measure_s": float(frames.measure_s.sum()),
+        "by_frame": [
+            {
+                "index": int(frames.index[row]),
+                "time_s": float(frames.time_s[row]),
+                "reason": frames.reason[row],
+                "violated_m": frames.violated.of(row).tolist(),
+                "undecided_m": frames.undecided.of(row).tolist(),
+                "measurements": int(frames.n_measured[row]),
+            }
+            for row in range(len(frames.index))
+        ],
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _numbers(values: NDArray[np.float64]) -> list[float | None]:
+    return [_number(value) for value in values.tolist()]

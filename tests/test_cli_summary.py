@@ -1,0 +1,291 @@
+"""``hybridve summary``: the numbers a report comes down to, in words, as JSON and as curves."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.sessions import write_ball_session, write_cube_scene
+
+from hybridve.hull.contact.backtrack import FirstContact
+from hybridve.hull.contact.clearance import Clearance
+from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.finding import Finding
+from hybridve.hull.contact.respond import Response
+from hybridve.hull.contact.uncertainty import Doubt
+from hybridve.hull.curves import write_curves
+from hybridve.hull.report.read import read_report
+from hybridve.hull.report.schema import FrameResult, ReportHeader
+from hybridve.hull.report.summarize import failing, summarize
+from hybridve.hull.report.write import ReportWriter
+
+Run = Callable[..., int]
+
+FREE = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+TOUCHING = Contact("colliding", FREE.points_world, FREE.triangle, np.ones(3))
+DOUBT = Doubt(0.002, 0.0, 0.05, np.zeros(2), False, 2, True, (), "real")
+
+#: When the one contact began, and how well that is known.
+BEGAN_S, BEGAN_DOUBT_S = 0.131, 0.02
+
+
+def near(
+    lower_mm: float, at_least_mm: float = np.nan, depth_mm: float = 0.0, **changes: Any
+) -> Finding:
+    """Return a finding with a clearance of `lower_mm` to 0.1 mm more."""
+    upper_mm = 0.0 if depth_mm else lower_mm + 0.1
+    clearance = Clearance(
+        lower_mm / 1e3,
+        upper_mm / 1e3,
+        np.ones(3),
+        np.zeros(3),
+        depth_mm / 1e3,
+        depth_mm / 1e3 + (1e-4 if depth_mm else 0.0),
+    )
+    doubt = replace(DOUBT, at_least_m=at_least_mm / 1e3)
+    return Finding(FREE, clearance, **{"doubt": doubt, **changes})
+
+
+def deep(depth_mm: float, **changes: Any) -> Finding:
+    vector = np.array([0.0, 0.0, 1.0])
+    response = Response(vector, vector, vector, vector, 0.0123, "", vector, vector, 0.0125, "")
+    touching = replace(near(0.0, depth_mm=depth_mm), contact=TOUCHING, response=response)
+    return replace(touching, **changes)
+
+
+ENTRY = deep(
+    4.0,
+    first_contact=FirstContact(0.5, 0.5, np.ones(3), "outline lost"),
+    first_contact_s=BEGAN_S,
+    first_contact_uncertainty_s=BEGAN_DOUBT_S,
+    approach_m_s=(0.2, 0.3),
+)
+PHANTOM = replace(
+    DOUBT, survives=False, hinges_on=("cam2", "cam1"), component="unsure", at_least_m=np.nan
+)
+FRAMES = [
+    near(20.0, 15.0),
+    near(9.95, 12.0),  # the bounds enclose the 10 mm that are required
+    near(7.0, 3.0),
+    ENTRY,
+    deep(6.0, doubt=PHANTOM),
+    None,
+    near(0.0, depth_mm=30.0),  # inside
+]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "report.h5"
+    header = ReportHeader(
+        command="hybridve detect",
+        objects=({"name": "box", "required_clearance_m": 0.01, "closed": True},),
+        settings={},
+        rig={},
+        engine="native",
+        renderer="",
+        parts=frozenset({"clearance", "first contact", "response", "doubt"}),
+        cameras=("cam1", "cam2"),
+    )
+    with ReportWriter(path, header) as writer:
+        for row, finding in enumerate(FRAMES):
+            findings = () if finding is None else (finding,)
+            reason = "torn" if finding is None else ""
+            writer.append(FrameResult(row + 100, row / 10, reason, findings, {}))
+        writer.finish()
+    return path
+
+
+def test_the_summary_counts_bounds_dates_and_names(path: Path) -> None:
+    (found,) = summarize(read_report(path))["objects"]
+
+    assert found["verdict"] == "colliding"
+    assert (found["frames_colliding"], found["frames_inside"]) == (2, 1)
+    assert found["frames_proved_free"] == 3
+    # Two touch, one is inside, one is certainly nearer than 10 mm; of another nobody can tell.
+    assert found["frames_below_required"] == 4
+    assert found["frames_perhaps_below_required"] == 1
+    assert found["clearance"]["lower_m"] == found["clearance"]["upper_m"] == 0.0
+    assert found["clearance"]["frame"] == 103
+    assert found["clearance"]["at_least_95_m"] == 0.0
+    assert found["depth"] == {
+        "lower_m": 0.03,
+        "upper_m": pytest.approx(0.0301),
+        "frame": 106,
+        "time_s": 0.6,
+    }
+    assert found["recovery"]["d_rec_m"] == 0.0123
+    assert found["recovery"]["d_rec_paper_m"] == 0.0125
+    assert (found["frames_hinging"], found["hinges_on"]) == (1, ["cam1", "cam2"])
+    assert found["frames_unsure"] == 1
+    first, inside = found["spans"]
+    assert (first["first_frame"], first["last_frame"]) == (103, 104)
+    assert first["first_contact_s"] == BEGAN_S
+    assert first["first_contact_status"] == "outline lost"
+    assert first["approach_m_s"] == [0.2, 0.3]
+    assert inside["first_contact_s"] is None
+    assert failing(summarize(read_report(path))) == ["box"]
+
+
+def only(frames: list[Finding], path: Path, required_m: float = 0.0) -> dict[str, Any]:
+    header = ReportHeader(
+        command="",
+        objects=({"name": "box", "required_clearance_m": required_m, "closed": True},),
+        settings={},
+        rig={},
+        engine="",
+        renderer="",
+        parts=frozenset({"clearance", "doubt"}),
+        cameras=("cam1", "cam2"),
+    )
+    with ReportWriter(path, header, overwrite=True) as writer:
+        for row, finding in enumerate(frames):
+            writer.append(FrameResult(row, row / 10, "", (finding,), {}))
+        writer.finish()
+    return summarize(read_report(path))
+
+
+def test_the_nearest_frame_and_the_least_at_95_percent_may_be_different_ones(
+    tmp_path: Path,
+) -> None:
+    numbers = only([near(20.0, 1.0), near(15.0, 12.0)], tmp_path / "r.h5")
+
+    (found,) = numbers["objects"]
+    assert found["verdict"] == "free"
+    assert found["clearance"]["frame"] == 1
+    assert found["clearance"]["lower_m"] == pytest.approx(0.015)
+    assert found["clearance"]["at_least_95_m"] == pytest.approx(0.001)
+    assert found["depth"] is None
+    assert found["spans"] == []
+    assert failing(numbers) == []
+
+
+def test_inside_alone_is_a_verdict_and_fails(tmp_path: Path) -> None:
+    numbers = only([near(0.0, depth_mm=30.0), near(20.0)], tmp_path / "r.h5")
+
+    (found,) = numbers["objects"]
+    assert found["verdict"] == "inside"
+    assert found["frames_proved_free"] == 1
+    assert len(found["spans"]) == 1
+    assert failing(numbers) == ["box"]
+
+
+@pytest.mark.parametrize(("lower_mm", "fails"), [(9.85, True), (9.95, False), (10.0, False)])
+def test_only_what_is_certainly_too_near_fails(
+    tmp_path: Path, lower_mm: float, fails: bool
+) -> None:
+    numbers = only([near(lower_mm)], tmp_path / "r.h5", required_m=0.01)
+
+    assert failing(numbers) == (["box"] if fails else [])
+
+
+def test_json_holds_no_number_that_json_does_not_know(
+    run: Run, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("summary", path, "--json") == 0
+
+    def refuse(name: str) -> float:
+        raise ValueError(name)
+
+    json.loads(capsys.readouterr().out, parse_constant=refuse)
+
+
+def test_the_text_says_what_must_be_known(
+    run: Run, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("summary", path) == 0
+
+    told = capsys.readouterr().out
+    assert "touched at 0.131 s, 20 ms either way at most (outline lost)" in told
+    assert "coming at 0.20-0.30 m/s" in told
+    assert "in 1 frame something is wholly inside, without touching the surface" in told
+    assert "hinges on a single camera: cam1, cam2" in told
+    assert "may hold nothing real" in told
+    assert "4, 1 more perhaps" in told
+    assert "30.00-30.10" in told
+    assert "12.30" in told
+
+
+def test_the_picture_shows_each_object_in_its_colours(
+    run: Run, tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "curves.png"
+
+    assert run("summary", path, "--picture", picture) == 0
+
+    assert f"clearance against time: {picture}" in capsys.readouterr().out
+    image = cv2.imread(str(picture))
+    assert image is not None
+    blue, green, red = image.astype(int).transpose(2, 0, 1)
+    assert ((blue > 150) & (red < 60)).sum() > 200, "bounds"
+    assert ((red > 200) & (blue < 190) & (green < 220) & (green > 100)).sum() > 2000, "a collision"
+    assert run("summary", path, "--picture", picture) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert run("summary", path, "--picture", picture, "--overwrite", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["picture"] == str(picture)
+
+
+@pytest.mark.parametrize(
+    ("picture", "status", "message"),
+    [("curves.gif", 2, "pictures are .png, .svg, .pdf"), ("no/curves.png", 1, "no folder")],
+)
+def test_a_picture_that_cannot_be_is_told_first(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    picture: str,
+    status: int,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    assert run("summary", "missing.h5", "--picture", picture) == status
+
+    assert message in capsys.readouterr().err
+
+
+def test_a_report_without_clearances_has_no_curves_and_says_how_to_get_them(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = write_ball_session(tmp_path / "session", np.zeros((1, 3)))
+    scene = write_cube_scene(tmp_path, {"cube": (0.0, 0.0, 0.0)})
+    path = tmp_path / "report.h5"
+    call = ("detect", session, "--scene", scene, "-o", path, "--viewport", 3, "--no-response")
+    assert run(*call, "--clearance-mm", 0) == 0
+    rows = read_report(path).objects["cube"]
+    assert "clearance_m" not in rows
+    assert "survives" not in rows
+    assert "d_rec_m" not in rows
+    capsys.readouterr()
+
+    assert run("summary", path, "--picture", tmp_path / "curves.png") == 1
+
+    assert "holds no clearances to draw" in capsys.readouterr().err
+    assert not (tmp_path / "curves.png").exists()
+
+
+def test_of_many_objects_the_nearest_are_drawn(
+    tmp_path: Path, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = read_report(path)
+    (rows,) = report.objects.values()
+    drawn: list[Any] = []
+    monkeypatch.setattr(
+        "hybridve.hull.curves.write_clearances", lambda *a, **k: drawn.append((a, k))
+    )
+    many = {}
+    for number in range(20):
+        away_m = rows["clearance_m"] + 0.001 * ((7 * number) % 20)
+        many[f"part{number}"] = replace(rows, columns={**rows.columns, "clearance_m": away_m})
+
+    write_curves(tmp_path / "curves.png", replace(report, objects=many))
+
+    ((_, curves), options) = drawn[0]
+    shown = [int(curve.name.removeprefix("part")) for curve in curves]
+    assert shown == sorted(number for number in range(20) if (7 * number) % 20 < 12)
+    assert options["note"] == "the nearest 12 of 20 objects"
