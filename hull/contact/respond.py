@@ -203,11 +203,13 @@ def collision_point(
         if np.isnan(contact.witness_world).any():
             raise ValueError("the contact has neither a collision point nor a witness")
         return contact.witness_world
-    points_world = contact.points_world.astype(np.float64)
     # Summed by hand: a reduction may add in another order for another number of points.
-    x, y, z = (points_world - reference_point_world).T
+    x, y, z = (
+        contact.points_world[:, axis].astype(np.float64) - reference_point_world[axis]
+        for axis in range(3)
+    )
     squared = x * x + y * y + z * z
-    farthest = points_world[squared == squared.max()]
+    farthest = contact.points_world[squared == squared.max()].astype(np.float64)
     first: NDArray[np.float64] = farthest[np.lexsort(farthest.T[::-1])[0]]
     return first
 

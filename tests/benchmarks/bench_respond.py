@@ -5,8 +5,8 @@ taken in turn. ``bench_exact`` is the walk along V_rec, the cameras that end it 
 ``bench_respond`` is both forms. Its `extra_info` holds, where both have an answer, the difference
 of their D_rec in micrometres, median and largest, beside the step of the window, which bounds it;
 of their N_hull in degrees, median and 95 %; and of each N_hull from that of the ball's cones in
-closed form. At 3 m a pixel is 4.3 mm wide, more than I, J, K and L are apart: their cross product follows
-the staircase of pixels, whatever the window.
+closed form. At 3 m a pixel is 4.3 mm wide, more than I, J, K and L are apart: their cross product
+follows the staircase of pixels, whatever the window.
 
 Run: pytest tests/benchmarks/bench_respond.py -o python_files='bench_*.py'
 -o python_functions='bench_*' --benchmark-columns=median,iqr,rounds
