@@ -245,12 +245,16 @@ def test_an_archive_of_something_else_is_no_entry(
     assert find_meshes(key) is None
 
 
+@pytest.mark.parametrize("about", [None, {}, {"parts": []}, {"parts": [{}]}, []])
 def test_a_damaged_entry_is_written_anew(
-    folder: Path, cube: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, cube: Path, monkeypatch: pytest.MonkeyPatch, about: Any
 ) -> None:
     first = read_cad(cube)
     (name,) = entries(folder)
-    (folder / name).write_bytes(b"\0" * 100)
+    if about is None:
+        (folder / name).write_bytes(b"\0" * 100)
+    else:
+        keep_meshes(name.removesuffix(".npz"), [(VERTICES, FACES)], about)
 
     read_cad(cube)
     without_readers(monkeypatch)

@@ -167,18 +167,22 @@ def _find(key: str) -> tuple[Contents, tuple[Topology, ...]] | None:
     if found is None:
         return None
     meshes, about = found
-    parts = tuple(
-        Part(
-            said["name"],
-            vertices,
-            faces,
-            said["material"],
-            None if said["rgba"] is None else tuple(said["rgba"]),
+    try:
+        parts = tuple(
+            Part(
+                said["name"],
+                vertices,
+                faces,
+                said["material"],
+                None if said["rgba"] is None else tuple(said["rgba"]),
+            )
+            for (vertices, faces), said in zip(meshes, about["parts"], strict=True)
         )
-        for (vertices, faces), said in zip(meshes, about["parts"], strict=True)
-    )
-    topologies = tuple(Topology(**said["topology"]) for said in about["parts"])
-    return Contents(parts, about["unit"], about["unit_m"], about["up"]), topologies
+        topologies = tuple(Topology(**said["topology"]) for said in about["parts"])
+        return Contents(parts, about["unit"], about["unit_m"], about["up"]), topologies
+    except (KeyError, TypeError, ValueError) as error:  # somebody else's entry
+        _log.info("an entry of the cache cannot be used, read anew: %r", error)
+        return None
 
 
 def _keep(key: str, contents: Contents, topologies: tuple[Topology, ...]) -> None:

@@ -19,7 +19,7 @@ _KIND = "meshes"
 
 #: Part of every key: the layout of an entry, what this package makes of a file by itself (it reads
 #: OBJ and glTF), and what it says of a mesh. Raised with any change of these.
-_VERSION = 2
+_VERSION = 3
 
 _Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 

@@ -1,12 +1,14 @@
 """The CAD scene: scene.toml, checked, its meshes placed in the world.
 
 A file becomes an object. A file of several parts becomes as many objects, called ``OBJECT.PART``
-after the names in the file; all keys of its table hold for each of them. In a part's name, ``/``
-and blanks become ``_``; a part without a name is ``part``; parts of the same name become ``bolt``,
-``bolt.2``, ``bolt.3`` in the file's order. ``parts = "merge"`` keeps the file as one object.
+after the names in the file; all keys of its table hold for each of them, and each has its own
+centre for a reference point unless the table gives one. In a part's name, ``/`` and blanks become
+``_``; a part without a name is ``part``; parts of the same name become ``bolt``, ``bolt.2``,
+``bolt.3`` in the file's order. ``parts = "merge"`` keeps the file as one object.
 
 A file is turned so that what is up in it is up in the world, before anything else is done: glTF is
-y up by its standard, COLLADA says, all others are taken as z up, and ``up`` overrides any of them.
+y up by its standard, FBX arrives so, COLLADA says, all others are taken as z up, and ``up``
+overrides any of them.
 STEP, glTF and COLLADA bring their unit (glTF is metres by its standard); for all others the scene
 must give it. For glTF and COLLADA it may, against what the file says; for STEP it may not.
 """
