@@ -232,11 +232,14 @@ def test_a_crack_wider_than_that_stays_open() -> None:
 
 
 def test_what_is_as_fine_as_the_noise_is_not_closed_by_it() -> None:
-    """A fin thinner than the noise would fall flat, and with it the hole it stands in."""
-    vertices, faces = soup(box(1.0, 1.0, 1e-8))
-    vertices[0, 2] = -1e-9
+    """A speck smaller than the noise would vanish, and its open edges with it."""
+    speck = [[0.5, 0.5, 0.5], [0.5 + 1e-8, 0.5, 0.5], [0.5, 0.5 + 1e-8, 0.5]]
 
-    assert not examine_topology(vertices, faces).closed
+    found = examine_topology(*with_triangles(box(1, 1, 1), [speck]))
+
+    assert counts(found) == (3, 0, 0)
+    assert found.n_zero_area == 0
+    assert not found.closed
 
 
 def test_signs_of_zero_are_no_difference() -> None:
