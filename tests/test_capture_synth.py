@@ -22,7 +22,16 @@ from hybridve.hull.capture.synth import (
     true_masks,
     write_session,
 )
-from hybridve.hull.capture.synth.meshes import Mesh, box_mesh, bracket_mesh, write_stl
+from hybridve.hull.capture.synth.meshes import (
+    Mesh,
+    ball_mesh,
+    bored_box_mesh,
+    box_mesh,
+    bracket_mesh,
+    frame_mesh,
+    sheet_mesh,
+    write_stl,
+)
 from hybridve.hull.capture.synth.render import make_view, shadow_lookup, shadow_map
 from hybridve.hull.capture.synth.shapes import Ball
 from hybridve.hull.capture.synth.stage import Lamp
@@ -242,6 +251,34 @@ def test_while_it_collides_an_object_has_no_clearance_and_else_no_penetration(
         np.testing.assert_array_equal(found.collides, found.clearance_m == 0)
 
 
+def test_the_hull_is_no_farther_than_the_shapes_and_says_so_only_within_its_reach(
+    truth: Truth,
+) -> None:
+    for name, found in truth.objects.items():
+        assert (found.hull_collides >= found.collides).all()
+        np.testing.assert_array_equal(found.hull_collides, found.hull_clearance_m == 0)
+        near = found.clearance_m < truth.hull_reach_m - truth.hull_resolution_m
+        if name != "shelf":
+            assert near.any()
+        allowed_m = found.clearance_m[near] + truth.tolerance_m + 2e-9
+        assert (found.hull_clearance_m[near] <= allowed_m).all()
+        assert (found.hull_clearance_m[~np.isnan(found.hull_clearance_m)] <= 0.1).all()
+
+
+def test_contacts_begin_between_the_frames_that_show_them(truth: Truth) -> None:
+    for found in truth.objects.values():
+        began = np.flatnonzero(found.collides[1:] & ~found.collides[:-1])
+        for frame in began:
+            inside = (found.contact_times_s * truth.fps >= frame) & (
+                found.contact_times_s * truth.fps <= frame + 1
+            )
+            assert inside.sum() == 1
+        assert len(found.contact_times_s) == len(found.contact_points_m)
+    # The arm enters once; at frames so far apart nothing is missed that a frame shows.
+    assert len(truth.objects["payload_a"].contact_times_s) == 1
+    assert len(truth.objects["shelf"].contact_times_s) == 0
+
+
 def test_clearances_and_penetrations_are_those_of_the_files_written(
     truth: Truth, scene: Scene
 ) -> None:
@@ -427,7 +464,7 @@ def test_another_version_of_the_truth_is_refused_by_name(tmp_path: Path) -> None
     with h5py.File(tmp_path / "truth.h5", "w") as file:
         file.attrs.update(format="hybridve-truth", version=99)
 
-    with pytest.raises(SessionError, match=r"version 99, expected 'hybridve-truth' version 1"):
+    with pytest.raises(SessionError, match=r"version 99, expected 'hybridve-truth' version 2"):
         read_truth(tmp_path)
 
 
@@ -437,6 +474,15 @@ def test_another_version_of_the_truth_is_refused_by_name(tmp_path: Path) -> None
         (box_mesh((240.0, 180.0, 160.0), 30.0), 240 * 180 * 160),
         (box_mesh((10.0, 10.0, 10.0), 100.0), 1000),
         (bracket_mesh((160.0, 120.0, 140.0), 30.0, 25.0), 120 * (160 * 30 + 30 * 110)),
+        (frame_mesh((800.0, 50.0, 900.0), 60.0, 70.0), 50 * (800 * 900 - 680 * 780)),
+        (  # less a prism over a regular polygon
+            bored_box_mesh((240.0, 200.0, 220.0), 32.0, 100.0, 24, 45.0),
+            240 * 200 * 220 - 100 * 12 * 32**2 * np.sin(np.pi / 12),
+        ),
+        (  # an icosahedron: its edge is 4 / sqrt(10 + 2 sqrt 5) of the radius
+            ball_mesh(50.0, 0),
+            5 / 12 * (3 + np.sqrt(5)) * (50 * 4 / np.sqrt(10 + 2 * np.sqrt(5))) ** 3,
+        ),
     ],
 )
 def test_meshes_are_closed_face_outwards_and_hold_their_volume(
@@ -452,6 +498,49 @@ def test_meshes_are_closed_face_outwards_and_hold_their_volume(
     assert {(b, a) for a, b in directed} == directed
     assert volume == pytest.approx(volume_mm3)
     assert len(np.unique(mesh.vertices_mm, axis=0)) == len(mesh.vertices_mm)
+
+
+@pytest.mark.parametrize("halvings", [1, 2, 3])
+def test_a_ball_of_triangles_is_closed_round_and_has_corners_on_the_axes(halvings: int) -> None:
+    mesh = ball_mesh(50.0, halvings)
+
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    directed = {tuple(edge) for edge in edges.tolist()}
+    assert len(mesh.faces) == 20 * 4**halvings
+    assert len(mesh.vertices_mm) == 10 * 4**halvings + 2
+    assert {(b, a) for a, b in directed} == directed
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices_mm, axis=1), 50.0)
+    for corner in 50.0 * np.concatenate([np.eye(3), -np.eye(3)]):
+        assert np.linalg.norm(mesh.vertices_mm - corner, axis=1).min() < 1e-9
+    # It lies between the sphere about it and the one within, and faces outwards.
+    a, b, c = np.moveaxis(mesh.triangles_mm, 1, 0)
+    normals = np.cross(b - a, c - a)
+    depth = np.einsum("ij,ij->i", a, normals) / np.linalg.norm(normals, axis=1)
+    volume = np.einsum("ij,ij->i", a, normals).sum() / 6
+    assert 4 / 3 * np.pi * depth.min() ** 3 < volume < 4 / 3 * np.pi * 50.0**3
+
+
+def test_a_sheet_is_one_piece_with_a_border_and_the_area_of_its_folds() -> None:
+    mesh = sheet_mesh((720.0, 800.0), (24, 15), 12.0, 4)
+
+    edges = np.sort(
+        np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    )
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert len(mesh.faces) == 720
+    assert (counts == 1).sum() == 2 * (24 + 15)
+    assert (counts == 2).sum() == (3 * 720 - 2 * (24 + 15)) // 2
+    a, b, c = np.moveaxis(mesh.triangles_mm, 1, 0)
+    # Six steps of 30 mm to a fold, at 0, +-60 and +-120 degrees: two level, four by 12 sin 60.
+    width = 4 * (2 * 30.0 + 4 * np.hypot(30.0, 12.0 * np.sqrt(3) / 2))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    assert area == pytest.approx(800.0 * width)
+
+
+def test_a_bore_that_does_not_fit_is_refused() -> None:
+    for radius_mm, depth_mm, sides in ((100.0, 50.0, 24), (20.0, 220.0, 24), (20.0, 50.0, 23)):
+        with pytest.raises(ValueError, match=r"leaves the box|multiple of four"):
+            bored_box_mesh((240.0, 200.0, 220.0), radius_mm, depth_mm, sides, 45.0)
 
 
 def test_triangles_are_no_longer_than_the_spacing() -> None:

@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 from hybridve.calib.pose import Pose, rotation_about_axes, transform
 from hybridve.hull.capture.synth.closest import TOLERANCE_M, closest_on_surface
 from hybridve.hull.capture.synth.meshes import box_mesh
-from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Shape
+from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Cylinder, Shape
 
 ROUNDING_M = 1e-12  # float64 at coordinates of a metre, with room for a few operations
 
 sizes = st.floats(0.01, 0.3)
 shapes = st.one_of(
-    st.builds(Ball, sizes), st.builds(Capsule, sizes, sizes), st.builds(Box, sizes, sizes, sizes)
+    st.builds(Ball, sizes),
+    st.builds(Capsule, sizes, sizes),
+    st.builds(Cylinder, sizes, sizes),
+    st.builds(Box, sizes, sizes, sizes),
 )
 coordinates = st.floats(-1.0, 1.0, allow_subnormal=False)
 points = st.tuples(coordinates, coordinates, coordinates).map(np.array)
@@ -86,6 +89,52 @@ def test_distance_of_a_box_is_that_to_its_nearest_surface_point(
         expected = float(np.linalg.norm(point - nearest))
 
     assert distance(Box(*half), point) == pytest.approx(expected, abs=ROUNDING_M)
+
+
+@given(half_length_m=sizes, radius_m=sizes, point=points)
+def test_distance_of_a_cylinder_is_that_to_its_nearest_surface_point(
+    half_length_m: float, radius_m: float, point: NDArray[np.float64]
+) -> None:
+    from_axis = float(np.hypot(point[0], point[1]))
+    height = abs(point[2])
+    if from_axis <= radius_m and height <= half_length_m:  # straight to the mantle or to an end
+        expected = -min(radius_m - from_axis, half_length_m - height)
+    else:
+        # In the plane of the axis and the point it is a rectangle.
+        nearest = np.array([min(from_axis, radius_m), min(height, half_length_m)])
+        expected = float(np.linalg.norm(nearest - [from_axis, height]))
+
+    assert distance(Cylinder(half_length_m, radius_m), point) == pytest.approx(
+        expected, abs=ROUNDING_M
+    )
+
+
+@given(half_length_m=sizes, radius_m=sizes, origin=points)
+def test_a_ray_along_the_axis_of_a_cylinder_enters_through_its_end(
+    half_length_m: float, radius_m: float, origin: NDArray[np.float64]
+) -> None:
+    above = origin + 2.0 * np.eye(3)[2]
+    assume(abs(np.hypot(above[0], above[1]) - radius_m) > 1e-9)
+
+    (entry,) = Cylinder(half_length_m, radius_m).hit(above, np.array([[0.0, 0.0, -1.0]]))
+
+    over_the_end = np.hypot(above[0], above[1]) < radius_m
+    assert entry == (pytest.approx(above[2] - half_length_m) if over_the_end else np.inf)
+
+
+@given(half_length_m=sizes, radius_m=sizes, direction=points)
+def test_the_outline_of_a_cylinder_reaches_as_far_as_it_does_in_every_direction(
+    half_length_m: float, radius_m: float, direction: NDArray[np.float64]
+) -> None:
+    assume(np.linalg.norm(direction) > 0.1)
+    cylinder = Cylinder(half_length_m, radius_m)
+    reaches = half_length_m * abs(direction[2]) + radius_m * np.hypot(direction[0], direction[1])
+
+    outline = cylinder.outline()
+
+    # A polygon of 100 corners lies within a circle by 1 - cos(pi / 100) of its radius.
+    assert reaches - 5e-4 * radius_m * 2 <= (outline @ direction).max() <= reaches + ROUNDING_M
+    assert np.linalg.norm(outline, axis=1).max() == pytest.approx(cylinder.reach_m)
 
 
 @given(shape=shapes, origin=points, toward=points)

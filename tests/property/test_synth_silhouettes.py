@@ -12,7 +12,7 @@ from hybridve.calib.lens import project_points
 from hybridve.calib.pose import Pose, rotation_about_axes, transform
 from hybridve.hull.capture.synth.presets import PRESETS
 from hybridve.hull.capture.synth.render import View, make_view, true_silhouette
-from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Shape
+from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Cylinder, Shape
 
 #: A pixel belongs to a silhouette if its centre does, so its border is known to half a pixel, or
 #: 0.71 px across the corner; the polygon through projected points falls short by less than 0.1 px.
@@ -68,7 +68,11 @@ def test_silhouette_of_a_ball_is_its_tangent_cone(
     camera=st.integers(0, 3),
     place=places,
     rotate_deg=st.tuples(angles_deg, angles_deg, angles_deg),
-    shape=st.one_of(st.builds(Capsule, sizes, sizes), st.builds(Box, sizes, sizes, sizes)),
+    shape=st.one_of(
+        st.builds(Capsule, sizes, sizes),
+        st.builds(Cylinder, sizes, sizes),
+        st.builds(Box, sizes, sizes, sizes),
+    ),
 )
 def test_points_of_a_shape_project_into_its_silhouette_and_fill_it(
     camera: int,

@@ -4,7 +4,8 @@ A preset says what there is: cameras around a room, a chessboard, real things in
 among them. From it come the files a real session has (stills of the board, the board on the floor,
 the empty room, the task; rendered through the true lens, with noise, flicker and soft shadows), and
 truth.h5, which says of every frame what the real shapes touched, how deep, how near, and which
-pixels show them.
+pixels show them; when contacts began; the same of the hull that perfect silhouettes would carve;
+and how much room the task needs.
 """
 
 from hybridve.hull.capture.synth.presets import BOXES_PASSING_CLEARANCE_M, PRESETS

@@ -62,33 +62,50 @@ def closest_on_surface(
     tolerance_m : float
         How far the result may lie above the true minimum.
     """
-    waiting = [
-        transform(invert(pose), triangles_world.reshape(-1, 3)).reshape(-1, 3, 3)
-        for pose in world_from_shape
-    ]
+    all_corners = triangles_world.reshape(-1, 3)
+    waiting = {
+        index: transform(invert(world_from_shape[index]), all_corners).reshape(-1, 3, 3)
+        for index in np.flatnonzero(_near_enough(all_corners, shapes, world_from_shape)).tolist()
+    }
     best = Closest(np.inf, 0, np.zeros(3))
     for _ in range(_MAX_DEPTH):
-        bounds = []
-        for index, (shape, corners) in enumerate(zip(shapes, waiting, strict=True)):
+        bounds = {}
+        for index, corners in waiting.items():
+            shape = shapes[index]
             centers = corners.mean(axis=1)
             at_center, slope = shape.signed_distance(centers)
             rises = np.einsum("nij,nj->ni", corners - centers[:, None], slope)  # (N, 3)
             lowest = rises.argmin(axis=1)
             rows = np.arange(len(corners))
-            bounds.append(at_center + rises[rows, lowest])
+            bounds[index] = at_center + rises[rows, lowest]
             tried = np.concatenate([centers, corners[rows, lowest]])
             distance = np.concatenate([at_center, shape.signed_distance(tried[len(rows) :])[0]])
-            if len(rows) and distance.min() < best.distance_m:
+            if distance.min() < best.distance_m:
                 winner = int(distance.argmin())
                 point = transform(world_from_shape[index], tried[winner : winner + 1])[0]
                 best = Closest(float(distance[winner]), index, point)
-        waiting = [
-            _halve(corners[bound < best.distance_m - tolerance_m])
-            for corners, bound in zip(waiting, bounds, strict=True)
-        ]
-        if not any(len(corners) for corners in waiting):
+        open_ = {index: bound < best.distance_m - tolerance_m for index, bound in bounds.items()}
+        waiting = {
+            index: _halve(corners[open_[index]])
+            for index, corners in waiting.items()
+            if open_[index].any()
+        }
+        if not waiting:
             break
     return best
+
+
+def _near_enough(
+    corners_world: NDArray[np.float64], shapes: Sequence[Shape], world_from_shape: Sequence[Pose]
+) -> NDArray[np.bool_]:
+    """Return which shapes (S,) can be the nearest, by their distance to the surface's box."""
+    middles = np.array([pose[:, 3] for pose in world_from_shape])
+    low, high = corners_world.min(axis=0), corners_world.max(axis=0)
+    to_box = np.linalg.norm(np.maximum(np.maximum(low - middles, middles - high), 0.0), axis=1)
+    # The middle of a shape lies in it, so no shape is farther than its middle from a corner.
+    at_most = np.linalg.norm(corners_world[None, ::3] - middles[:, None], axis=2).min()
+    reach = np.array([shape.reach_m for shape in shapes])
+    return np.asarray(to_box - reach <= at_most)
 
 
 def _halve(corners: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -359,16 +359,25 @@ def add_shapes(
     kernel = np.ones((3, 3), np.uint8)
     at_edge = cv2.dilate(seen, kernel) != cv2.erode(seen, kernel)
     rows, columns = np.nonzero((seen > 0) & ~at_edge)
+    numbers = seen[rows, columns]
+    among = {int(number): np.flatnonzero(numbers == number) for number in np.unique(numbers)}
     color, _ = _shape_colors(
-        view, view.rays_cam[rows, columns], lamp, shapes, world_from_shape, seen[rows, columns]
+        view, view.rays_cam[rows, columns], lamp, shapes, world_from_shape, among
     )
     picture[rows, columns] = color
 
     rows, columns = np.nonzero(at_edge)
     total = np.zeros((len(rows), 3))
     covered = np.zeros(len(rows))
-    # Which shapes an edge pixel can see are those its neighbourhood sees.
-    present = np.unique(seen)
+    # Which shapes an edge pixel can see are those in whose window it lies.
+    present = np.unique(seen[seen > 0])
+    among = {}
+    for number in present:
+        window = _shape_window(view, shapes[number - 1].shape, world_from_shape[number - 1])
+        if window is not None:
+            inside = (rows >= window[0].start) & (rows < window[0].stop)
+            inside &= (columns >= window[1].start) & (columns < window[1].stop)
+            among[int(number)] = np.flatnonzero(inside)
     offsets = _offsets(4)
     for x, y in offsets:
         rays = (
@@ -376,9 +385,7 @@ def add_shapes(
             + x * view.across[rows, columns]
             + y * view.down[rows, columns]
         )
-        color, hit = _shape_colors(
-            view, rays, lamp, shapes, world_from_shape, present[present > 0], choose=True
-        )
+        color, hit = _shape_colors(view, rays, lamp, shapes, world_from_shape, among)
         total += color * hit[:, None]
         covered += hit
     covered /= len(offsets)
@@ -393,18 +400,16 @@ def _shape_colors(
     lamp: Lamp,
     shapes: Sequence[RealShape],
     world_from_shape: Sequence[Pose],
-    numbers: NDArray[np.uint8],
-    choose: bool = False,
+    among: dict[int, NDArray[np.int64]],
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the colours (N, 3) that rays (N, 2) see, and which (N,) meet a shape.
 
-    `numbers` says which shape each ray meets; with `choose`, which shapes there are to be met.
+    `among` has the numbers of the shapes that may be met, and for each which rays may meet it.
     """
     directions = view.directions_world(rays)
     along = np.full(len(rays), np.inf)
     met = np.zeros(len(rays), np.uint8)
-    for number in np.unique(numbers):
-        mine = np.arange(len(rays)) if choose else np.flatnonzero(numbers == number)
+    for number, mine in among.items():
         shape = shapes[number - 1].shape
         entry = _hit(view, shape, world_from_shape[number - 1], directions[mine])
         closer = entry < along[mine]

@@ -1,7 +1,7 @@
 """A preset becomes a folder: session.toml, scene.toml, images, videos, meshes and truth.h5."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,12 +19,14 @@ from hybridve.calib.lens import cam_from_img, img_from_cam
 from hybridve.calib.pose import Pose, rotation_about_axes, transform
 from hybridve.calib.target import Chessboard
 from hybridve.hull.capture.synth import render
-from hybridve.hull.capture.synth.closest import closest_on_surface
+from hybridve.hull.capture.synth.cones import Surface, TrueHull
+from hybridve.hull.capture.synth.entries import Motion
 from hybridve.hull.capture.synth.meshes import write_stl
 from hybridve.hull.capture.synth.presets import PRESETS
 from hybridve.hull.capture.synth.render import Picture, View
+from hybridve.hull.capture.synth.spacing import needed_for_hulls, needed_for_shapes
 from hybridve.hull.capture.synth.stage import Preset, Stage, plate_of
-from hybridve.hull.capture.synth.truth import TruthWriter, is_generated
+from hybridve.hull.capture.synth.truth import PartInFrame, TruthWriter, is_generated, look_at
 
 Progress = Callable[[str, int, int], None]
 
@@ -53,6 +55,7 @@ def write_session(
     *,
     seed: int = 0,
     n_frames: int | None = None,
+    options: Mapping[str, float] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> None:
@@ -74,6 +77,8 @@ def write_session(
     n_frames : int, optional
         Frames of the task; the preset's own number if left out. The whole motion is shown in as
         many frames as there are.
+    options : mapping of float, optional
+        Values of the preset's own options; the others keep their defaults.
     overwrite : bool
         Whether a generated recording that stands in `folder` is replaced. A folder that holds
         anything else is never touched.
@@ -83,8 +88,8 @@ def write_session(
     Raises
     ------
     SessionError
-        If there is no such preset, a number is out of range, or the folder is taken or cannot be
-        written.
+        If there is no such preset or option, a number is out of range, or the folder is taken or
+        cannot be written.
     """
     if preset not in PRESETS:
         raise SessionError(f"there is no preset {preset!r}; one of {', '.join(PRESETS)}")
@@ -94,16 +99,35 @@ def write_session(
         raise SessionError(f"preset {preset!r}: {count} frames asked for, expected at least 1")
     if seed < 0:
         raise SessionError(f"preset {preset!r}: the seed is {seed}, expected 0 or more")
-    job = _Job(preset, chosen, chosen.make_stage(), seed, count, progress or _silent)
+    values = _values_of(preset, chosen, options or {})
+    stage = chosen.make_stage(**values)
+    job = _Job(preset, chosen, values, stage, seed, count, progress or _silent)
     with _appearing(folder, overwrite) as partial:
         _write_toml(partial, job)
         _record(partial, job)
+
+
+def _values_of(name: str, preset: Preset, given: Mapping[str, float]) -> dict[str, float]:
+    """Return a value for each option of a preset, or say which of those given cannot be."""
+    options = {option.name: option for option in preset.options}
+    for key, value in given.items():
+        if key not in options:
+            known = ", ".join(options) or "none"
+            raise SessionError(f"preset {name!r} has no option {key}; its options: {known}")
+        option = options[key]
+        if not option.low <= value <= option.high or (option.is_whole and value != int(value)):
+            raise SessionError(
+                f"preset {name!r}: {key} is {value:g}, expected {option.low:g} to {option.high:g}"
+            )
+    values = {key: given.get(key, option.default) for key, option in options.items()}
+    return {key: int(v) if options[key].is_whole else float(v) for key, v in values.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
     name: str
     preset: Preset
+    options: dict[str, float]
     stage: Stage
     seed: int
     n_frames: int
@@ -190,6 +214,7 @@ def _record(folder: Path, job: _Job) -> None:
             seed=job.seed,
             fps=job.preset.fps,
             n_frames=job.n_frames,
+            options=job.options,
         ) as truth,
     ):
         for done, (place, poses) in enumerate(
@@ -235,7 +260,9 @@ def _write_task(
 ) -> None:
     stage = job.stage
     shapes = [real.shape for real in stage.shapes]
-    surfaces = [part.triangles_world for part in stage.parts]
+    surfaces = [Surface(part.triangles_world) for part in stage.parts]
+    frames: list[list[Pose]] = []
+    found: list[list[PartInFrame]] = []
     videos = [
         _open_video(place.folder / "video.avi", place.view.camera, job.preset.fps)
         for place in places
@@ -261,15 +288,46 @@ def _write_task(
                 return seen > 0
 
             masks = list(pool.map(take, places))
+            hull = TrueHull(stage.cameras, shapes, poses)
+            frames.append(poses)
+            found.append([look_at(surface, hull, shapes, poses) for surface in surfaces])
             truth.write_frame(
                 poses,
                 {place.view.camera.name: mask for place, mask in zip(places, masks, strict=True)},
-                [closest_on_surface(surface, shapes, poses) for surface in surfaces],
+                found[-1],
             )
     finally:
         for video in videos:
             video.release()
     job.progress("frames", job.n_frames, job.n_frames)
+    _write_motion(job, truth, frames, found)
+
+
+def _write_motion(
+    job: _Job, truth: TruthWriter, frames: list[list[Pose]], found: list[list[PartInFrame]]
+) -> None:
+    """Write what is true of the motion as a whole: when contacts begin, and the room it needs."""
+    stage = job.stage
+    total = len(stage.parts) + len(stage.spacings)
+    motion = Motion(stage, job.n_frames)
+    for number, part in enumerate(stage.parts):
+        job.progress("motion", number, total)
+        at_frames = [parts[number].closest for parts in found]
+        truth.write_entries(part.name, motion.entries(part.triangles_world, at_frames))
+    shapes = [real.shape for real in stage.shapes]
+    for number, spacing in enumerate(stage.spacings, start=len(stage.parts)):
+        job.progress("motion", number, total)
+        part = next(part for part in stage.parts if part.name == spacing.part)
+        asked = (
+            part.triangles_world,
+            np.array(spacing.along),
+            spacing.range_m,
+            part.required_clearance_mm / 1000.0,
+        )
+        by_shapes = needed_for_shapes(*asked, shapes, frames)
+        hulls = [TrueHull(stage.cameras, shapes, poses) for poses in frames]
+        truth.write_spacing(spacing, by_shapes, needed_for_hulls(*asked, hulls, by_shapes))
+    job.progress("motion", total, total)
 
 
 def hold_board(
@@ -390,8 +448,10 @@ def _video(path: Path, camera: Camera, fps: float) -> Iterator[cv2.VideoWriter]:
 def _write_toml(folder: Path, job: _Job) -> None:
     stage, preset = job.stage, job.preset
     board = stage.board
+    chosen = "".join(f", {name} {value:g}" for name, value in job.options.items())
     lines = [
-        f"# Generated: preset {job.name}, seed {job.seed}. What is true of it stands in truth.h5.",
+        f"# Generated: preset {job.name}{chosen}, seed {job.seed}. "
+        "What is true of it stands in truth.h5.",
         'format = "hybridve-session"',
         "version = 1",
         f"fps = {preset.fps:g}",
@@ -422,6 +482,7 @@ def _write_toml(folder: Path, job: _Job) -> None:
         write_stl(folder / "meshes" / f"{part.name}.stl", part.mesh, f"{part.name}, millimetres")
         lines += [
             "",
+            *(f"# {line}" for line in part.comment.splitlines()),
             "[[object]]",
             f'name = "{part.name}"',
             f'mesh = "meshes/{part.name}.stl"',
@@ -431,4 +492,7 @@ def _write_toml(folder: Path, job: _Job) -> None:
         ]
         if part.required_clearance_mm:
             lines.append(f"required_clearance_mm = {part.required_clearance_mm:g}")
+        if part.recovery_direction is not None:
+            direction = ", ".join(f"{value:g}" for value in part.recovery_direction)
+            lines.append(f"recovery_direction = [{direction}]")
     (folder / "scene.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")

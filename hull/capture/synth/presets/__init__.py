@@ -1,9 +1,17 @@
 """The recordings that can be generated, by name."""
 
+from hybridve.hull.capture.synth.presets.ball import BALL
 from hybridve.hull.capture.synth.presets.boxes import BOXES, BOXES_PASSING_CLEARANCE_M
+from hybridve.hull.capture.synth.presets.curtain import CURTAIN
+from hybridve.hull.capture.synth.presets.payload import PAYLOAD
 from hybridve.hull.capture.synth.stage import Preset
 
 __all__ = ["BOXES_PASSING_CLEARANCE_M", "PRESETS"]
 
 #: The recordings by name.
-PRESETS: dict[str, Preset] = {"boxes": BOXES}
+PRESETS: dict[str, Preset] = {
+    "boxes": BOXES,
+    "payload": PAYLOAD,
+    "ball": BALL,
+    "curtain": CURTAIN,
+}

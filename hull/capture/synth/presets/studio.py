@@ -1,10 +1,14 @@
 """What recordings share: the room, the lamp, the board, cameras on a ring, and ways to move."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from hybridve.calib.camera import Camera
+from hybridve.calib.pose import Pose
 from hybridve.calib.target import Chessboard
-from hybridve.hull.capture.synth.stage import Lamp, Panel, Room
+from hybridve.hull.capture.synth.stage import Lamp, Panel, Room, pose_at
 
 #: The calibration target.
 BOARD = Chessboard(columns=8, rows=5, square_m=0.1)
@@ -88,3 +92,40 @@ def there_and_back(moment: float, turn: float) -> float:
     """Return 0 at the beginning and the end and 1 at `turn`, smoothly."""
     way = moment / turn if moment <= turn else (1.0 - moment) / (1.0 - turn)
     return float(0.5 - 0.5 * np.cos(np.pi * way))
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """Where something is at a moment.
+
+    Attributes
+    ----------
+    moment : float
+        From 0 to 1.
+    position : tuple of 3 float
+        Metres, world.
+    rotate_deg : tuple of 3 float
+        Turned about x, then y, then z.
+    """
+
+    moment: float
+    position: tuple[float, float, float]
+    rotate_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def track(keys: Sequence[Key]) -> Callable[[float], Pose]:
+    """Return the motion that goes from key to key and rests at each for an instant.
+
+    Before the first key and after the last it stands still.
+    """
+    moments = np.array([key.moment for key in keys])
+    values = np.array([[*key.position, *key.rotate_deg] for key in keys])
+
+    def pose(moment: float) -> Pose:
+        index = int(np.clip(np.searchsorted(moments, moment) - 1, 0, len(keys) - 2))
+        way = (moment - moments[index]) / (moments[index + 1] - moments[index])
+        eased = 0.5 - 0.5 * np.cos(np.pi * np.clip(way, 0.0, 1.0))
+        x, y, z, a, b, c = values[index] + eased * (values[index + 1] - values[index])
+        return pose_at((float(x), float(y), float(z)), (float(a), float(b), float(c)))
+
+    return pose

@@ -1,0 +1,209 @@
+"""The hull of true shapes against cones in closed form, and distances to it against its points."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hybridve.calib.lens import cam_from_img, project_points
+from hybridve.calib.pose import Pose, rotation_about_axes, transform
+from hybridve.hull.capture.synth.cones import RESOLUTION_M, Surface, TrueHull
+from hybridve.hull.capture.synth.meshes import box_mesh
+from hybridve.hull.capture.synth.presets import PRESETS
+from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Cylinder
+
+CAMERAS = PRESETS["boxes"].make_stage().cameras
+
+#: Float64 at a few metres, through an arcsine.
+ROUNDING_RAD = 1e-7
+
+places = st.tuples(st.floats(0.1, 0.6), st.floats(-0.1, 0.4), st.floats(0.3, 0.8)).map(np.array)
+offsets = st.tuples(*[st.floats(-0.12, 0.12)] * 3).map(np.array)
+sizes = st.floats(0.02, 0.08)
+angles_deg = st.floats(-180.0, 180.0)
+
+
+def at(place: NDArray[np.float64]) -> Pose:
+    return np.column_stack([np.eye(3), place])
+
+
+@given(place=places, radius_m=sizes, offset=offsets)
+def test_a_point_is_in_the_hull_of_a_ball_if_every_tangent_cone_holds_it(
+    place: NDArray[np.float64], radius_m: float, offset: NDArray[np.float64]
+) -> None:
+    point = place + offset
+    margins = []
+    for camera in CAMERAS:
+        toward, ray = place - camera.center_world, point - camera.center_world
+        across = float(np.linalg.norm(np.cross(toward, ray)))
+        angle = np.arctan2(across, float(toward @ ray))
+        margins.append(np.arcsin(radius_m / np.linalg.norm(toward)) - angle)
+    assume(min(np.abs(margins)) > ROUNDING_RAD)
+
+    (inside,) = TrueHull(CAMERAS, [Ball(radius_m)], [at(place)]).contains(point[None])
+
+    assert inside == (min(margins) > 0)
+
+
+@given(
+    place=places,
+    other=places,
+    radius_m=sizes,
+    rotate_deg=st.tuples(angles_deg, angles_deg, angles_deg),
+    offset=offsets,
+)
+def test_the_hull_holds_the_shapes_and_the_points_they_explain_together(
+    place: NDArray[np.float64],
+    other: NDArray[np.float64],
+    radius_m: float,
+    rotate_deg: tuple[float, float, float],
+    offset: NDArray[np.float64],
+) -> None:
+    turned = np.column_stack([rotation_about_axes(rotate_deg), other])
+    shapes = (Ball(radius_m), Cylinder(2 * radius_m, radius_m))
+    poses = (at(place), turned)
+    point = place + offset
+
+    (inside,) = TrueHull(CAMERAS, shapes, poses).contains(point[None])
+
+    # Along the way from each camera and beyond, some point lies in a shape; and the reverse.
+    seen = []
+    for camera in CAMERAS:
+        ray = point - camera.center_world
+        along = camera.center_world + np.linspace(0.0, 2.0, 2001)[:, None] * ray
+        depths = [
+            shape.signed_distance((along - pose[:, 3]) @ pose[:, :3])[0].min()
+            for shape, pose in zip(shapes, poses, strict=True)
+        ]
+        seen.append(min(depths))
+    spacing_m = 2.0 * max(np.linalg.norm(point - c.center_world) for c in CAMERAS) / 2000
+    if max(seen) < 0:
+        assert inside
+    if inside:
+        assert max(seen) < spacing_m
+
+
+def test_what_a_camera_does_not_see_is_not_in_the_hull() -> None:
+    camera = CAMERAS[0]
+    right, _, forward = camera.cam_from_world[:, :3]
+    behind = camera.center_world - 2.0 * forward
+    assert not TrueHull([camera], [Ball(0.1)], [at(behind)]).contains(behind[None]).any()
+
+    # A big ball on the left border of the image: half of its middle line is out of sight.
+    (slope,) = cam_from_img(camera, np.array([[0.0, 240.0]]))
+    border = camera.center_world + 2.0 * np.append(slope, 1.0) @ camera.cam_from_world[:, :3]
+    points = border + np.linspace(-0.1, 0.1, 40)[:, None] * right
+    pixels, _ = project_points(camera, points)
+    in_sight = pixels[:, 0] >= 0
+    assert 0 < in_sight.sum() < len(points)
+
+    inside = TrueHull([camera], [Ball(0.5)], [at(border)]).contains(points)
+
+    np.testing.assert_array_equal(inside, in_sight)
+
+
+@settings(deadline=None, max_examples=60)
+@given(place=places, radius_m=sizes, offset=offsets, camera=st.integers(0, 3))
+def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
+    place: NDArray[np.float64], radius_m: float, offset: NDArray[np.float64], camera: int
+) -> None:
+    center = CAMERAS[camera].center_world
+    point = place + offset
+    toward, ray = place - center, point - center
+    half = np.arcsin(radius_m / np.linalg.norm(toward))
+    angle = np.arctan2(float(np.linalg.norm(np.cross(toward, ray))), float(toward @ ray))
+    assume(angle > half + 1e-3)
+    expected_m = float(np.linalg.norm(ray) * np.sin(angle - half))
+    speck = point + 1e-7 * np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+
+    hull = TrueHull([CAMERAS[camera]], [Ball(radius_m)], [at(place)])
+    found = hull.distance(Surface(speck), within_m=expected_m + 0.02)
+
+    assert not found.collides
+    assert expected_m - 1e-6 <= found.distance_m <= expected_m + RESOLUTION_M + 1e-6
+    beyond = hull.distance(Surface(speck), within_m=0.9 * expected_m)
+    assert beyond.distance_m == np.inf
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    place=places,
+    sizes_m=st.tuples(sizes, sizes, sizes),
+    rotate_deg=st.tuples(angles_deg, angles_deg, angles_deg),
+    offset=st.tuples(*[st.floats(-0.25, 0.25)] * 3).map(np.array),
+    seed=st.integers(0, 1000),
+)
+def test_no_point_of_the_hull_is_nearer_than_the_distance_and_a_collision_is_one(
+    place: NDArray[np.float64],
+    sizes_m: tuple[float, float, float],
+    rotate_deg: tuple[float, float, float],
+    offset: NDArray[np.float64],
+    seed: int,
+) -> None:
+    turned = np.column_stack([rotation_about_axes(rotate_deg), place])
+    shapes, poses = (Box(*sizes_m), Capsule(0.1, 0.02)), (turned, at(place + 0.04))
+    triangles = box_mesh((80.0, 60.0, 40.0), 30.0).triangles_mm / 1000.0 + place + offset
+    surface = Surface(triangles)
+    hull = TrueHull(CAMERAS, shapes, poses)
+
+    found = hull.distance(surface, within_m=0.2)
+
+    rng = np.random.default_rng(seed)
+    points = place + rng.uniform(-0.2, 0.2, (3000, 3))
+    inside = points[hull.contains(points)]
+    if len(inside):
+        nearest_m = surface.distance(inside)[0].min()
+        assert found.distance_m <= nearest_m + 1e-12 or nearest_m > 0.2 - RESOLUTION_M
+    weights = rng.dirichlet(np.ones(3), (len(triangles), 20))
+    samples = (weights[..., None] * triangles[:, None]).sum(axis=2).reshape(-1, 3)
+    if hull.contains(samples).any() and not found.collides:
+        assert found.distance_m <= RESOLUTION_M
+    if np.isfinite(found.distance_m):  # somewhere near there is a point of the hull
+        close = hull.points_within(surface, found.distance_m + 2 * RESOLUTION_M)
+        assert len(close)
+        assert hull.contains(close).all()
+
+
+@given(
+    corners=st.lists(offsets, min_size=3, max_size=9),
+    points=st.lists(offsets, min_size=1, max_size=5),
+)
+def test_a_surface_is_as_near_as_the_nearest_of_its_dense_samples(
+    corners: list[NDArray[np.float64]], points: list[NDArray[np.float64]]
+) -> None:
+    triangles = np.array([corners[i : i + 3] for i in range(len(corners) - 2)])
+    areas = np.linalg.norm(
+        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
+    )
+    assume(areas.min() > 1e-5)
+    steps = 60
+    i, j = (k.ravel() for k in np.mgrid[: steps + 1, : steps + 1])
+    keep = i + j <= steps
+    u, v = (k[keep][:, None] / steps for k in (i, j))
+    a, b, c = (triangles[:, None, k] for k in range(3))
+    samples = (a + (b - a) * u + (c - a) * v).reshape(-1, 3)
+    spacing_m = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max() / steps
+
+    distances, places_ = Surface(triangles).distance(np.array(points))
+
+    for point, distance_m, place in zip(points, distances, places_, strict=True):
+        sampled = np.linalg.norm(samples - point, axis=1).min()
+        assert sampled - spacing_m <= distance_m <= sampled + 1e-9
+        assert np.linalg.norm(place - point) == pytest.approx(distance_m, abs=1e-12)
+        assert np.linalg.norm(samples - place, axis=1).min() <= spacing_m
+
+
+def test_a_witness_shortens_the_search_and_leaves_the_answer() -> None:
+    stage = PRESETS["boxes"].make_stage()
+    poses = stage.poses(0.45)
+    shapes = [real.shape for real in stage.shapes]
+    hull = TrueHull(stage.cameras, shapes, poses)
+    surface = Surface(stage.parts[1].triangles_world)
+    in_ball = transform(poses[3], np.zeros((1, 3)))
+
+    alone = hull.distance(surface, within_m=0.3)
+    helped = hull.distance(surface, within_m=0.3, witnesses_world=in_ball)
+
+    assert abs(alone.distance_m - helped.distance_m) <= RESOLUTION_M
+    assert not alone.collides
