@@ -17,6 +17,9 @@ with a wrong shift lies within the blend with the right one, for what stands sti
 moves. A shift that is off by e thins an outline of radius r by no more than e^2 / (8 r), so whole
 pixels are good enough.
 
+An outline that moves by one pixel passes that pixel half-way, by construction: a thing slower than
+some pixels a frame has its contact in the middle, which is the best that can be said.
+
 What no shift explains and no blend keeps, something that was not there a frame before, is told by
 the status "outline lost": then the instant is unknown within the frame.
 """
