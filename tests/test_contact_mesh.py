@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.step_files import step_assembly, step_box, step_cylinder, step_file
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
@@ -318,6 +320,27 @@ def test_nodes_place_meshes_and_mirrors_keep_the_outside_outside(tmp_path: Path)
     np.testing.assert_allclose(b.vertices, SQUARE * [-2, -3, -1] + [10, 0, 0], atol=1e-12)
     assert a.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
     assert b.faces.tolist() == [[0, 2, 1], [0, 3, 2]]
+
+
+@given(
+    axis=st.tuples(*[st.integers(-5, 5)] * 3).filter(any),
+    angle=st.floats(-7, 7),
+)
+def test_quaternions_turn_about_their_axis(
+    tmp_path_factory: pytest.TempPathFactory, axis: tuple[int, int, int], angle: float
+) -> None:
+    unit = np.array(axis) / np.linalg.norm(axis)
+    gltf = square_gltf()
+    quaternion = [*(unit * np.sin(angle / 2)), np.cos(angle / 2)]
+    gltf.document["nodes"] = [{"mesh": 0, "rotation": quaternion, "scale": [1, 2, 1]}]
+    path = write(tmp_path_factory.mktemp("turn") / "part.glb", gltf.glb())
+
+    found = read_cad(path).parts[0].vertices
+
+    points = SQUARE * [1, 2, 1]  # Rodrigues' formula
+    along = np.outer(points @ unit, unit)
+    across = np.cross(unit, points) * np.sin(angle) + (points - along) * np.cos(angle)
+    np.testing.assert_allclose(found, along + across, atol=1e-12)
 
 
 def test_primitives_of_a_mesh_are_one_part_and_lines_are_none(tmp_path: Path) -> None:
