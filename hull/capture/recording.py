@@ -216,6 +216,39 @@ def stored_frames(
         yield FrameSilhouettes(index, masks, "", decoded - started, time.perf_counter() - decoded)
 
 
+def silhouettes_of(
+    session: Session,
+    stored: Path | None,
+    frames: FrameRange,
+    *,
+    undistortions: list[Undistortion] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Generator[FrameSilhouettes]:
+    """Yield the silhouettes of a session's frames, from where they are stored or cut out now.
+
+    Parameters
+    ----------
+    session : Session
+        The recordings.
+    stored : Path or None
+        What `stored_silhouettes` says.
+    frames, undistortions, progress
+        As of `segmented_frames`.
+
+    Raises
+    ------
+    SessionError
+        As of `segmented_frames`.
+    ReportError
+        If stored silhouettes cannot be read.
+    """
+    if stored is None:
+        yield from segmented_frames(session, frames, undistortions=undistortions, progress=progress)
+        return
+    with SilhouetteReader(stored) as reader:
+        yield from stored_frames(session, reader, frames, undistortions=undistortions)
+
+
 def silhouette_stamp(session: Session, rig_digest: str | None) -> str:
     """Return a text that changes whenever the session's silhouettes could.
 

@@ -159,15 +159,16 @@ class SessionSpacing:
     settings : dict
         What was recorded, as plain JSON values.
     shift_m : float
-        The smallest shift that is proved to keep every clearance in every frame; NaN if none in
-        the range is.
+        The smallest shift that is proved to keep every clearance in every frame, as do those up to
+        the tolerance above it; NaN if none in the range does.
     at_least_m : float
         The smallest shift that truly does is not below this; NaN if none in the range does.
     binding : Binding or None
         What keeps it from being smaller; if none is free, what is worst at the end of the range.
         None where the begin of the range is free.
     free_m : (N, 2) float64
-        Stretches of the range that are proved to keep every clearance, metres.
+        Stretches of the range that are proved to keep every clearance, metres; narrower ones than
+        the tolerance are left out, but for one at the end of the range.
     curve : SpacingCurve
         How many frames violate.
     at_zero : (2,) int64, or None

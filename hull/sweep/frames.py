@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 
@@ -10,13 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
-from hybridve.hull.capture.recording import (
-    FrameRange,
-    FrameSilhouettes,
-    segmented_frames,
-    stored_frames,
-)
-from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.capture.recording import FrameRange, silhouettes_of
 from hybridve.hull.contact.detect import Body
 from hybridve.hull.evaluate import Chain
 from hybridve.hull.query.bounds import boxes_are_free
@@ -90,7 +84,14 @@ def read_hulls(
     """
     frames: list[HullFrame] = []
     n_bytes = 0
-    with closing(_silhouettes(chain, progress)) as silhouettes:
+    found = silhouettes_of(
+        chain.session,
+        chain.silhouettes,
+        chain.settings.frames,
+        undistortions=chain.undistortions,
+        progress=progress,
+    )
+    with closing(found) as silhouettes:
         for frame in silhouettes:
             advance()
             if frame.masks is None:
@@ -139,14 +140,3 @@ def near_bodies(hull: Hull, bodies: list[Body]) -> NDArray[np.bool_]:
         np.array([body.lower_world for body in bodies]),
         np.array([body.upper_world for body in bodies]),
     )
-
-
-def _silhouettes(
-    chain: Chain, progress: Callable[[str, int, int], None] | None
-) -> Generator[FrameSilhouettes, None, None]:
-    frames, lenses = chain.settings.frames, chain.undistortions
-    if chain.silhouettes is not None:
-        with SilhouetteReader(chain.silhouettes) as reader:
-            yield from stored_frames(chain.session, reader, frames, undistortions=lenses)
-        return
-    yield from segmented_frames(chain.session, frames, undistortions=lenses, progress=progress)

@@ -1,0 +1,350 @@
+"""How much room a recorded task needs: one replay of the recording, for all shifts at once."""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import SceneError, SessionError
+from hybridve.hull.capture.recording import silhouettes_of
+from hybridve.hull.contact.clearance import ClearanceMeter
+from hybridve.hull.contact.scene import Scene, SceneObject
+from hybridve.hull.contact.spacing import (
+    METER_SHARE,
+    NOTHING,
+    BlockedShifts,
+    Move,
+    MovedObject,
+    blocked_shifts,
+    covers,
+    tightest_at,
+    union,
+    verdict_at,
+    without,
+)
+from hybridve.hull.evaluate import Chain, resolved_settings
+from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.report.spacing_file import (
+    Binding,
+    SessionSpacing,
+    Spacing,
+    SpacingCurve,
+    SpacingFrames,
+    make_stretches,
+)
+from hybridve.hull.view.spacing_chart import ShiftCurve, write_spacing_chart
+
+#: Points of a curve at most; what a frame blocks is known for all shifts anyway.
+_MOST_POINTS = 100_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """What is moved, what stays, and whereto; it serves for several recordings.
+
+    Attributes
+    ----------
+    move : Move
+        Whereto.
+    moved, standing : tuple of MovedObject
+        The objects that are moved, and all others of the scene.
+    moved_names, standing_names : tuple of str
+        Their names.
+    """
+
+    move: Move
+    moved: tuple[MovedObject, ...]
+    standing: tuple[MovedObject, ...]
+    moved_names: tuple[str, ...]
+    standing_names: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, scene: Scene, names: Sequence[str], move: Move, clearance_m: float | None = None
+    ) -> Self:
+        """Return the layout of a scene of which the objects with these names are moved.
+
+        Parameters
+        ----------
+        scene : Scene
+            All objects.
+        names : sequence of str
+            Which are moved.
+        move : Move
+            Whereto.
+        clearance_m : float, optional
+            What all moved objects require; by default each what the scene says of it.
+
+        Raises
+        ------
+        SceneError
+            If the scene has no such object, or a name is given twice.
+        """
+        known = [one.name for one in scene.objects]
+        for number, name in enumerate(names):
+            if name not in known:
+                raise SceneError(
+                    f"{scene.path}: there is no object {name!r} to move; the scene has "
+                    f"{', '.join(known)}"
+                )
+            if name in names[:number]:
+                raise SceneError(f"{scene.path}: object {name!r} is to move twice; name it once")
+
+        def measured(one: SceneObject, required_m: float) -> MovedObject:
+            meter = ClearanceMeter(
+                one.vertices_world,
+                one.faces,
+                is_closed=one.is_closed,
+                tolerance_m=METER_SHARE * move.tolerance_m,
+            )
+            return MovedObject(meter, required_m)
+
+        moved = [one for one in scene.objects if one.name in names]
+        standing = [one for one in scene.objects if one.name not in names]
+        return cls(
+            move,
+            tuple(
+                measured(one, one.required_clearance_m if clearance_m is None else clearance_m)
+                for one in moved
+            ),
+            tuple(measured(one, one.required_clearance_m) for one in standing),
+            tuple(one.name for one in moved),
+            tuple(one.name for one in standing),
+        )
+
+
+def shifts_of(move: Move, step_m: float | None = None) -> NDArray[np.float64]:
+    """Return the shifts (S,) of a curve in metres: both ends of the range, and steps between.
+
+    Raises
+    ------
+    SceneError
+        If these were too many.
+    """
+    length_m = move.stop_m - move.start_m
+    step_m = length_m / 200.0 if step_m is None else step_m
+    n_steps = length_m / step_m
+    if n_steps > _MOST_POINTS:
+        raise SceneError(
+            f"a curve of {n_steps:.0f} steps of {1e3 * step_m:g} mm: at most {_MOST_POINTS}; take "
+            "longer steps"
+        )
+    steps_m = move.start_m + step_m * np.arange(int(np.ceil(n_steps)))
+    return np.append(steps_m[steps_m < move.stop_m], move.stop_m)
+
+
+def replay(
+    name: str,
+    chain: Chain,
+    layout: Layout,
+    shifts_m: NDArray[np.float64],
+    *,
+    progress: Callable[[str, int, int], None] | None = None,
+    advance: Callable[[], object] = lambda: None,
+) -> SessionSpacing:
+    """Return how much room the task of one recording needs; each frame is looked at once.
+
+    Parameters
+    ----------
+    name : str
+        What the session is called.
+    chain : Chain
+        The recording, with the scene of the layout.
+    layout : Layout
+        What is moved.
+    shifts_m : (S,) float64
+        Where to count the frames that violate, ascending.
+    progress : callable, optional
+        Told ``(what, done, total)`` while the backgrounds are learnt.
+    advance : callable
+        Told after each frame.
+
+    Raises
+    ------
+    SessionError
+        If none of the frames can be evaluated.
+    """
+    tally = _Tally(layout)
+    found = silhouettes_of(
+        chain.session,
+        chain.silhouettes,
+        chain.settings.frames,
+        undistortions=chain.undistortions,
+        progress=progress,
+    )
+    with closing(found) as silhouettes:
+        for frame in silhouettes:
+            time_s = frame.index / chain.session.fps
+            if frame.masks is None:
+                tally.leave_out(frame.index, time_s, frame.reason)
+            else:
+                tally.look(frame.index, time_s, make_hull(chain.views, frame.masks))
+            advance()
+    if not tally.n_valid:
+        raise SessionError(
+            f"{chain.session.path}: none of the frames {chain.settings.frames} can be evaluated; "
+            "choose others with --frames"
+        )
+    settings = resolved_settings(chain)
+    kept = ("session", "session_sha256", "frames", "unseen", "min_cameras", "silhouettes")
+    return tally.answer(name, {key: settings[key] for key in kept}, shifts_m)
+
+
+class _Tally:
+    """What the frames that were looked at say together. No hull is kept."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._index: list[int] = []
+        self._time_s: list[float] = []
+        self._reason: list[str] = []
+        self._blocked: list[BlockedShifts] = []
+        self._measure_s: list[float] = []
+        self._together = NOTHING
+        self._at_end: dict[float, Binding] = {}
+        self._standing = np.zeros((len(layout.standing), 2), np.int64)
+
+    @property
+    def n_valid(self) -> int:
+        """How many frames were looked at."""
+        return sum(not reason for reason in self._reason)
+
+    def leave_out(self, index: int, time_s: float, reason: str) -> None:
+        """Take note of a frame that cannot be evaluated."""
+        self._note(index, time_s, reason, BlockedShifts(NOTHING, NOTHING, 0), 0.0)
+
+    def look(self, index: int, time_s: float, hull: Hull) -> None:
+        """Find out what a frame blocks, and what it is that does where that may be the answer."""
+        layout = self._layout
+        started = time.perf_counter()
+        blocked = blocked_shifts(hull, layout.moved, layout.move)
+        mine = union(blocked.violated_m, blocked.undecided_m)
+        self._together = union(self._together, mine)
+        ends = set(mine[:, 1].tolist()).intersection(self._together[:, 1].tolist())
+        for shift_m in ends:
+            # At the end of the range the worst frame is kept; elsewhere there is but one.
+            found = self._binding(index, time_s, hull, shift_m)
+            known = self._at_end.get(shift_m)
+            if known is None or _spare_m(found) < _spare_m(known):
+                self._at_end[shift_m] = found
+        for number, one in enumerate(layout.standing):
+            verdict = verdict_at(hull, one, layout.move, 0.0)
+            self._standing[number] += (verdict == "violates", verdict == "undecided")
+        self._note(index, time_s, "", blocked, time.perf_counter() - started)
+
+    def _note(
+        self, index: int, time_s: float, reason: str, blocked: BlockedShifts, measure_s: float
+    ) -> None:
+        self._index.append(index)
+        self._time_s.append(time_s)
+        self._reason.append(reason)
+        self._blocked.append(blocked)
+        self._measure_s.append(measure_s)
+
+    def _binding(self, index: int, time_s: float, hull: Hull, shift_m: float) -> Binding:
+        layout = self._layout
+        number, clearance = tightest_at(hull, layout.moved, layout.move, shift_m)
+        return Binding(
+            frame=index,
+            time_s=time_s,
+            object_name=layout.moved_names[number],
+            shift_m=shift_m,
+            on_hull_world=clearance.on_hull_world,
+            on_object_world=clearance.on_object_world,
+            clearance_m=np.array(clearance.signed_m),
+            required_m=layout.moved[number].clearance_m,
+        )
+
+    def answer(
+        self, name: str, settings: dict[str, object], shifts_m: NDArray[np.float64]
+    ) -> SessionSpacing:
+        """Return what all frames say together."""
+        move = self._layout.move
+        whole = np.array([[move.start_m, move.stop_m]])
+        free_m = without(whole, self._together)
+        # What is left between two undecided pieces is no place to build anything.
+        is_wide = free_m[:, 1] - free_m[:, 0] >= move.tolerance_m
+        free_m = free_m[is_wide | (free_m[:, 1] == move.stop_m)]
+        maybe_m = without(whole, union(*(one.violated_m for one in self._blocked)))
+        shift_m = float(free_m[0, 0]) if len(free_m) else np.nan
+        # What decides ends where the free begins; if nothing is free, it is what is worst at last.
+        binding = self._at_end.get(shift_m if len(free_m) else move.stop_m)
+        violated, undecided = self._counts(shifts_m)
+        at_zero = None
+        if move.start_m <= 0 <= move.stop_m:
+            counts = self._counts(np.zeros(1))
+            at_zero = (int(counts[0][0]), int(counts[1][0]))
+        return SessionSpacing(
+            name=name,
+            settings=settings,
+            shift_m=shift_m,
+            at_least_m=float(maybe_m[0, 0]) if len(maybe_m) else np.nan,
+            binding=binding,
+            free_m=free_m,
+            curve=SpacingCurve(shifts_m, violated, undecided),
+            at_zero=at_zero,
+            frames=SpacingFrames(
+                index=np.array(self._index, np.uint32),
+                time_s=np.array(self._time_s),
+                reason=tuple(self._reason),
+                violated=make_stretches([one.violated_m for one in self._blocked]),
+                undecided=make_stretches([one.undecided_m for one in self._blocked]),
+                n_measured=np.array([one.n_measured for one in self._blocked], np.uint32),
+                measure_s=np.array(self._measure_s),
+            ),
+            standing={
+                one: (violates, unknown)
+                for one, (violates, unknown) in zip(
+                    self._layout.standing_names, self._standing.tolist(), strict=True
+                )
+            },
+        )
+
+    def _counts(
+        self, shifts_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+        """Return how many frames violate at shifts (S,), and of how many that is not known."""
+        violated = np.zeros(len(shifts_m), np.uint32)
+        undecided = np.zeros(len(shifts_m), np.uint32)
+        for one in self._blocked:
+            certain = covers(one.violated_m, shifts_m)
+            violated += certain
+            undecided += covers(one.undecided_m, shifts_m) & ~certain
+        return violated, undecided
+
+
+def _spare_m(binding: Binding) -> float:
+    return float(binding.clearance_m[1]) - binding.required_m
+
+
+def write_picture_of(path: Path, spacing: Spacing) -> None:
+    """Draw how many frames violate against the shift, one curve a session.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    """
+    settings = spacing.settings
+    curves = [
+        ShiftCurve(
+            name=f"{one.name} ({one.frames.n_valid} frames)",
+            shift_mm=1e3 * one.curve.shift_m,
+            violated=one.curve.violated.astype(np.float64),
+            at_most=(one.curve.violated + one.curve.undecided).astype(np.float64),
+            answer_mm=1e3 * one.shift_m,
+        )
+        for one in spacing.sessions
+    ]
+    direction = ", ".join(f"{value:.3g}" for value in settings["direction"])
+    required = ", ".join(f"{1e3 * one:g}" for one in dict.fromkeys(settings["required_m"]))
+    title = (
+        f"{', '.join(settings['move'])} along ({direction}), keeping {required} mm: frames that "
+        "violate it"
+    )
+    write_spacing_chart(path, curves, title=title)

@@ -1,0 +1,102 @@
+"""Frames that violate a clearance against how far objects were moved, drawn."""
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from hybridve.hull.view.chart import _STYLES, _refuse_suffix, _save
+
+_SIZE_IN = (10.0, 5.2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShiftCurve:
+    """One recording at S shifts.
+
+    Attributes
+    ----------
+    name : str
+        What it is called.
+    shift_mm : (S,) float64
+        Ascending.
+    violated, at_most : (S,) float64
+        Frames that certainly violate, and these with all that may.
+    answer_mm : float
+        The smallest shift that none violates; NaN if there is none.
+    """
+
+    name: str
+    shift_mm: NDArray[np.float64]
+    violated: NDArray[np.float64]
+    at_most: NDArray[np.float64]
+    answer_mm: float
+
+
+def write_spacing_chart(path: Path, curves: Sequence[ShiftCurve], *, title: str) -> None:
+    """Draw one curve a recording into a picture, which appears only when it is complete.
+
+    Parameters
+    ----------
+    path : Path
+        A .png, .svg or .pdf.
+    curves : sequence of ShiftCurve
+        At least one, over the same range.
+    title : str
+        Above them.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    ValueError
+        If the name has another ending.
+    """
+    _refuse_suffix(path)
+    _save(draw_spacing_chart(curves, title=title), path)
+
+
+def draw_spacing_chart(curves: Sequence[ShiftCurve], *, title: str) -> Figure:
+    """Return the figure of `write_spacing_chart`."""
+    figure = Figure(figsize=_SIZE_IN, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    most = max(float(curve.at_most.max()) for curve in curves)
+    for number, curve in enumerate(curves):
+        colour, marker = _STYLES[number % len(_STYLES)]
+        # Curves often lie on each other: earlier ones are drawn wider, so that all are seen.
+        width = 1.5 + 2.5 * (1.0 - (number + 1) / len(curves))
+        label = curve.name
+        if np.isnan(curve.answer_mm):
+            label += ": none is free"
+        else:
+            label += f": {curve.answer_mm:.1f} mm"
+            axes.axvline(curve.answer_mm, color=colour, linestyle="--", linewidth=0.9)
+            axes.plot(
+                [curve.answer_mm],
+                [0.0],
+                marker,
+                color=colour,
+                markersize=9,
+                clip_on=False,
+                zorder=5,
+            )
+        axes.plot(curve.shift_mm, curve.violated, color=colour, linewidth=width, label=label)
+        axes.fill_between(
+            curve.shift_mm, curve.violated, curve.at_most, color=colour, alpha=0.3, linewidth=0
+        )
+    axes.set_xlabel("moved by, mm")
+    axes.set_ylabel("frames that violate")
+    axes.set_ylim(0.0, max(1.05 * most, 1.0))
+    axes.set_xlim(float(curves[0].shift_mm[0]), float(curves[0].shift_mm[-1]))
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(color="#DDDDDD", linewidth=0.5)
+    axes.legend(title="smallest shift that no frame violates", fontsize=8, title_fontsize=8)
+    figure.suptitle("\n".join(textwrap.wrap(title, 100)), fontsize=10)
+    return figure
