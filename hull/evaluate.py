@@ -55,7 +55,7 @@ from hybridve.hull.report.schema import FrameResult, Part
 
 @dataclass(frozen=True, slots=True)
 class EvaluateSettings:
-    """How a recording is evaluated.
+    """How a recording is evaluated; by default for contacts alone.
 
     Attributes
     ----------
@@ -82,10 +82,10 @@ class EvaluateSettings:
     viewport: int | None = 10
     accuracy_m: float | None = None
     open_at_m: float | None = 1e-4
-    clearance_m: float | None = 1e-4
-    response: ResponseSettings | None = field(default_factory=ResponseSettings)
+    clearance_m: float | None = None
+    response: ResponseSettings | None = None
     backtrack: bool = False
-    doubt: DoubtSettings | None = field(default_factory=DoubtSettings)
+    doubt: DoubtSettings | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,9 @@ from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
+from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.scene import load_scene
+from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import Chain, EvaluateSettings, evaluate, make_chain
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
@@ -60,7 +62,13 @@ def engine() -> Iterator[Engine]:
 
 
 def chain_of(session: Path, scene: Path, **changes: Any) -> Chain:
-    settings = EvaluateSettings(viewport=6, backtrack=True)
+    settings = EvaluateSettings(
+        viewport=6,
+        clearance_m=1e-4,
+        response=ResponseSettings(),
+        backtrack=True,
+        doubt=DoubtSettings(),
+    )
     return make_chain(load_session(session), load_scene(scene), replace(settings, **changes))
 
 
