@@ -275,7 +275,8 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
         if up != "z":
             columns, signs = _FROM_UP[up]
             vertices = vertices[:, columns] * signs
-        vertices_world = (vertices * unit_m) @ rotation.T + translation_m
+        # Not with @, whose threads cost more than they save here, and may round by their number.
+        vertices_world = np.einsum("ij,kj->ik", vertices * unit_m, rotation) + translation_m
         if entry.reference_point_mm is not None:
             reference_point_world = (
                 rotation @ (np.array(entry.reference_point_mm) / 1000.0) + translation_m
