@@ -216,19 +216,23 @@ def evaluation_of(
     from math import radians
 
     from hybridve.hull.contact.respond import ResponseSettings
-    from hybridve.hull.contact.uncertainty import DoubtSettings
     from hybridve.hull.evaluate import EvaluateSettings
 
     if backtrack and not response:
         raise click.UsageError("--backtrack says where the response begins; drop --no-response")
-    assumed = DoubtSettings() if mask_std_px is None else DoubtSettings(segmentation_px=mask_std_px)
+    assumed = None
+    if doubt and clearance_mm:
+        from hybridve.hull.contact.uncertainty import DoubtSettings
+
+        known = {} if mask_std_px is None else {"segmentation_px": mask_std_px}
+        assumed = DoubtSettings(**known)
     return EvaluateSettings(
         clearance_m=clearance_mm / 1000.0 or None,
         response=ResponseSettings(radians(abc_deg), abc_mm / 1000.0, abc_window)
         if response
         else None,
         backtrack=backtrack,
-        doubt=assumed if doubt and clearance_mm else None,
+        doubt=assumed,
         **others,
     )
 

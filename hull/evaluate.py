@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -46,11 +46,13 @@ from hybridve.hull.contact.detect import (
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
 from hybridve.hull.contact.respond import Response, ResponseSettings, respond
 from hybridve.hull.contact.scene import Scene
-from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 from hybridve.hull.report.schema import FrameResult, Part
+
+if TYPE_CHECKING:
+    from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,7 @@ class EvaluateSettings:
     clearance_m: float | None = None
     response: ResponseSettings | None = None
     backtrack: bool = False
-    doubt: DoubtSettings | None = None
+    doubt: "DoubtSettings | None" = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,7 +247,7 @@ class _Tools:
     engine: Engine
     certifier: Certifier | None
     meters: list[ClearanceMeter]
-    doubter: Doubter | None
+    doubter: "Doubter | None"
 
     @classmethod
     @contextmanager
@@ -264,6 +266,9 @@ class _Tools:
             ]
         doubter = None
         if "doubt" in computed_parts(settings):
+            # Late: it brings scipy's optimisers, for which a picture or a sweep need not wait.
+            from hybridve.hull.contact.uncertainty import Doubter, outline_errors
+
             shift_px = [_mask_shift_px(chain)[name] for name in chain.views.names]
             errors = outline_errors(
                 chain.views.names, chain.rig.provenance, shift_px, settings.doubt

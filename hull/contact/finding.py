@@ -1,6 +1,7 @@
 """All that one frame says of one object, bundled."""
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,7 +9,9 @@ from hybridve.hull.contact.backtrack import FirstContact
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.respond import Response
-from hybridve.hull.contact.uncertainty import Doubt
+
+if TYPE_CHECKING:
+    from hybridve.hull.contact.uncertainty import Doubt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +44,7 @@ class Finding:
     first_contact_s: float = np.nan
     first_contact_uncertainty_s: float = np.nan
     response: Response | None = None
-    doubt: Doubt | None = None
+    doubt: "Doubt | None" = None
 
     @property
     def touches(self) -> bool:
