@@ -244,3 +244,48 @@ def points_of(part: CadPart, shift_m: float) -> NDArray[np.float64]:
     lower_m = place[2] - 0.08 + shift_m
     height_m = lower_m - part.required_clearance_mm / 1000.0
     return np.column_stack([x.ravel() + place[0], y.ravel() + place[1], np.full(x.size, height_m)])
+
+
+#: What belongs together, by the beginning of its name, in the presets with hands.
+THINGS = {"green": "left", "yellow": "right", "tongs": "right", "plug": "right"}
+
+
+@pytest.mark.parametrize(
+    ("preset", "options", "held"),
+    [
+        ("ball", {}, []),
+        # The cord goes down the pipe, with the fingers above it or in the tongs, which enter too.
+        (
+            "payload",
+            {"participant": 1, "gap_mm": 150.0},
+            [{"cord", "pipe"}, {"cord", "right"}],
+        ),
+        (
+            "payload",
+            {"participant": 4, "gap_mm": 150.0},
+            [{"cord", "pipe"}, {"cord", "right"}, {"pipe", "right"}],
+        ),
+    ],
+)
+def test_hands_do_not_run_through_what_they_do_not_hold(
+    preset: str, options: dict[str, float], held: list[set[str]]
+) -> None:
+    stage = PRESETS[preset].make_stage(**options)
+    give_m = 0.004  # fingers about the pipe
+    for moment in np.linspace(0.0, 1.0, 25):
+        poses = stage.poses(float(moment))
+        for real, pose in zip(stage.shapes, poses, strict=True):
+            outline = real.shape.outline() @ pose[:, :3].T + pose[:, 3]
+            for other, other_pose in zip(stage.shapes, poses, strict=True):
+                first, second = (
+                    THINGS.get(name.split("_")[0], name.split("_")[0])
+                    for name in (real.name, other.name)
+                )
+                apart_m = np.linalg.norm(pose[:, 3] - other_pose[:, 3])
+                if first == second or apart_m > real.shape.reach_m + other.shape.reach_m:
+                    continue
+                if {first, second} in held:
+                    continue
+                local = (outline - other_pose[:, 3]) @ other_pose[:, :3]
+                depth_m = -other.shape.signed_distance(local)[0].min()
+                assert depth_m < give_m, (moment, real.name, other.name)

@@ -238,15 +238,19 @@ class TrueHull:
             keep &= _in_image(camera, centers_world, radius_m)
             rays = centers_world - camera.center_world
             away = np.linalg.norm(rays, axis=1)
-            for number, shape in enumerate(self._shapes):
-                rows = np.flatnonzero(keep & shapes[:, number])
+            # One shape that may be met is enough to keep a cell: those that most may meet first.
+            undecided = keep.copy()
+            for number in np.argsort(-shapes[keep].sum(axis=0), kind="stable"):
+                rows = np.flatnonzero(undecided & shapes[:, number])
                 if len(rows):
                     pose = self._shape_from_world[number]
                     origin = transform(pose, camera.center_world[None])[0]
                     directions = (rays[rows] / away[rows, None]) @ pose[:, :3].T
-                    meets = _may_meet(shape, origin, directions, radius_m / away[rows])
+                    slack = radius_m / away[rows]
+                    meets = _may_meet(self._shapes[number], origin, directions, slack)
                     shapes[rows[~meets], number] = False
-            keep &= shapes.any(axis=1)
+                    undecided[rows[meets]] = False
+            keep &= ~undecided
         return keep
 
 

@@ -197,21 +197,20 @@ class Cylinder:
         Inside, the distance is that to the nearer of the mantle and the ends.
         """
         across = np.hypot(points[:, 0], points[:, 1])
-        outwards = np.zeros_like(points)  # on the axis any direction is a subgradient: z serves
-        outwards[:, 2] = across == 0
-        off = across > 0
-        outwards[off, :2] = points[off, :2] / across[off, None]
-        upwards = np.zeros_like(points)
-        upwards[:, 2] = np.where(points[:, 2] < 0, -1.0, 1.0)
-
         past_mantle = across - self.radius_m
         past_end = np.abs(points[:, 2]) - self.half_length_m
         mantle, end = np.maximum(past_mantle, 0.0), np.maximum(past_end, 0.0)
         outside = np.hypot(mantle, end)
-        slope = np.where((past_mantle > past_end)[:, None], outwards, upwards)
         is_outside = outside > 0
-        rows = (mantle[:, None] * outwards + end[:, None] * upwards)[is_outside]
-        slope[is_outside] = rows / outside[is_outside, None]
+        share = np.where(is_outside, outside, 1.0)
+        to_mantle = past_mantle > past_end
+        # On the axis nothing grows outwards: zero is a subgradient there.
+        outwards = np.where(is_outside, mantle / share, to_mantle) / np.where(across > 0, across, 1)
+        slope = np.zeros_like(points)
+        slope[:, :2] = outwards[:, None] * points[:, :2]
+        slope[:, 2] = np.where(is_outside, end / share, ~to_mantle) * np.where(
+            points[:, 2] < 0, -1.0, 1.0
+        )
         return np.where(is_outside, outside, np.maximum(past_mantle, past_end)), slope
 
     def hit(self, origin: Points, directions: Points) -> NDArray[np.float64]:

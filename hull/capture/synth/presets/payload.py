@@ -160,7 +160,7 @@ def _pipe_and_hand(air_m: float) -> tuple[Actor, Actor]:
     leaving = track(
         (
             Key(0.43, (x, y, in_place)),
-            Key(0.56, (x - 0.12, y - 0.50, in_place + 0.02), (0.0, 0.0, 6.0)),
+            Key(0.55, (x - 0.22, y - 0.50, in_place + 0.02), (0.0, 0.0, 6.0)),
             Key(0.66, (x - 0.30, y - 1.25, in_place), (0.0, 0.0, 10.0)),
         )
     )
