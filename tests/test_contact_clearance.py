@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from hybridve.hull.capture.synth.meshes import box_mesh
 from hybridve.hull.contact.clearance import ClearanceMeter
-from hybridve.hull.contact.distance import DistanceOctree, SurfaceDistance
+from hybridve.hull.contact.distance import SurfaceDistance
+from hybridve.hull.contact.lattice import Best, DistanceLattice, bound_cells
+from hybridve.hull.query.cells import make_cell_frame
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 
@@ -230,22 +232,76 @@ def test_the_side_of_a_closed_surface() -> None:
     assert (distance < 0).sum() > 1000
 
 
-def test_an_octree_computes_a_distance_once() -> None:
-    vertices, faces = sheet(0.5, 0.0)
-    octree = DistanceOctree(SurfaceDistance(vertices, faces, is_closed=False))
-    octree.make_room(8)
-    octree.n_nodes += 8
-    numbers, centers = np.array([3, 5]), np.array([[0, 0, 1.0], [0, 0, 2.0]])
-    octree.fill(numbers, centers)
-    np.testing.assert_allclose(octree.distance_m[numbers], [1, 2])
-    octree.fill(numbers, centers + 7.0)  # known: not asked again
-    np.testing.assert_allclose(octree.distance_m[numbers], [1, 2])
-    octree.make_room(100_000)
-    np.testing.assert_allclose(octree.distance_m[numbers], [1, 2])
-    assert (octree.first_child == -1).all()
-    octree.forget()
-    assert octree.n_nodes == 1
-    assert np.isnan(octree.distance_m).all()
+def test_a_lattice_computes_a_distance_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Corners are shared by neighbours, by levels and by frames."""
+    asked: list[NDArray[np.float64]] = []
+    original = SurfaceDistance.signed
+
+    def counted(
+        surface: SurfaceDistance, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        asked.append(points)
+        return original(surface, points)
+
+    monkeypatch.setattr(SurfaceDistance, "signed", counted)
+    lattice = DistanceLattice(SurfaceDistance(*sheet(0.5, 0.0), is_closed=False), 4.0)
+    grid = np.array(np.meshgrid(*[np.arange(-3, 4, 2.0)] * 3)).reshape(3, -1).T  # 4 x 4 x 4 cubes
+    for _ in range(2):
+        cubes = lattice.cubes(grid, 1.0, 0.1)
+        assert sum(len(points) for points in asked) == 5**3
+    lattice.cubes(grid[:1] / 2, 0.5, 0.1)  # an eighth of one: 19 corners are new at most
+    everywhere = np.concatenate(asked)
+    assert len(np.unique(everywhere, axis=0)) == len(everywhere) <= 5**3 + 7
+    octants = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
+    corners = grid[:, None] + octants[:, ::-1]  # x changes first
+    expected = np.linalg.norm(
+        np.concatenate([np.maximum(np.abs(corners[..., :2]) - 0.5, 0), corners[..., 2:]], -1),
+        axis=-1,
+    )
+    np.testing.assert_allclose(lattice.distance_m[cubes.corner], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_bounds_of_cells_hold_at_every_point_of_them(is_closed: bool) -> None:
+    """Cells in cubes larger by any power of two, on either side of and across a surface."""
+    rng = np.random.default_rng(2)
+    half = np.array([0.1, 0.15, 0.02])
+    surface = SurfaceDistance(*box(tuple(2 * half), (0, 0, 0)), is_closed=is_closed)
+    views = ring_views()
+    asked = make_cell_frame(make_hull(views, _masks(views, 0)), np.zeros(3), 4.0)
+    sides = set()
+    for level in range(3, 14):
+        lattice = DistanceLattice(surface, 4.0)
+        cube_half_m = 4.0 / 2**level
+        steps = np.floor(half * rng.uniform(-1.5, 1.5, (40, 3)) / (2 * cube_half_m))
+        cube_center = (2 * steps + 1) * cube_half_m
+        cubes = lattice.cubes(cube_center, cube_half_m, 1e-4)
+        sides |= set(cubes.side.tolist())
+        for deeper in (0, 1, 2, 5):
+            half_m = cube_half_m / 2**deeper
+            place = rng.integers(0, 2**deeper, (40, 3))
+            center = cube_center - cube_half_m + (2 * place + 1) * half_m
+            lower_m, deepest = bound_cells(
+                center,
+                np.zeros(40, np.bool_),
+                half_m,
+                np.arange(40),
+                cubes,
+                lattice.distance_m,
+                lattice.nearest,
+                asked,
+                Best(np.full(1, np.inf), np.full(3, np.nan)),
+            )
+            assert deepest == -1
+            points = center[:, None] + half_m * rng.uniform(-1, 1, (40, 200, 3))
+            beyond = np.abs(points) - half
+            outside = np.linalg.norm(np.maximum(beyond, 0), axis=-1)
+            truth = outside + np.minimum(beyond.max(axis=-1), 0)
+            truth = truth if is_closed else np.abs(truth)
+            assert (truth >= lower_m[:, None] - 1e-6).all()  # the side is not asked that near
+            # And they are worth something: within a diagonal of what was found.
+            assert (truth.min(axis=1) - lower_m <= 4 * np.sqrt(3) * cube_half_m).all()
+    assert sides == ({-1, 0, 1} if is_closed else {1})
 
 
 def test_forgetting_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -256,7 +312,7 @@ def test_forgetting_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = box((0.2, 0.2, 0.2), (0.3, 0, 0))
     remembering = ClearanceMeter(vertices, faces, is_closed=True)
     expected = [remembering.measure(hull).signed_m for hull in hulls]
-    monkeypatch.setattr("hybridve.hull.contact.distance._MOST_NODES", 100)
+    monkeypatch.setattr("hybridve.hull.contact.lattice._MOST_CORNERS", 100)
     forgetting = ClearanceMeter(vertices, faces, is_closed=True)
     assert [forgetting.measure(hull).signed_m for hull in hulls] == expected
 

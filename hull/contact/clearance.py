@@ -6,17 +6,17 @@ camera proves that no point of the hull is in it, or once it cannot hold a point
 surface than the best one found, less the tolerance:
 
 * upper bound: a point of the hull, and the point of the surface nearest to it (both are returned);
-* lower bound: every point of the hull is in a cube that was dropped for its distance, and the
-  signed distance to the surface changes by at most a metre a metre.
+* lower bound: every point of the hull is in a cube that was dropped for its distance, and how near
+  to the surface a point of a cube can be follows from the cube's corners
+  (`hybridve.hull.contact.lattice`).
 
 Of a closed object the distance is negative inside, so that the same search finds the deepest point
 of the hull beneath the surface. That depth is *not* the way that separates the two: a thin rod
-through the middle of a box is as deep as half the box is thick. Its bounds hold, but they may be
-farther apart than the tolerance.
+through the middle of a box is as deep as half the box is thick.
 
-Distances at the centres of cubes depend on the object alone. They are kept from frame to frame
-(`hybridve.hull.contact.distance`), in the object's frame, and serve wherever it is moved to. What
-is found depends on the hull, the object and its place only, never on what was asked before.
+Distances at corners of cubes depend on the object alone. They are kept from frame to frame, in the
+object's frame, and serve wherever it is moved to. What is found depends on the hull, the object and
+its place only, never on what was asked before.
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.distance import DistanceOctree, SurfaceDistance
-from hybridve.hull.query.cells import keep_near, make_best, make_cell_frame, split_cells
+from hybridve.hull.contact.distance import SurfaceDistance
+from hybridve.hull.contact.lattice import (
+    FINEST_LEVEL,
+    Best,
+    Cubes,
+    DistanceLattice,
+    bound_cells,
+)
+from hybridve.hull.query.cells import CellFrame, are_inside, make_cell_frame, split_cells
 from hybridve.hull.query.silhouettes import Hull
 
 #: Half of the root's edge at least, metres, and in sizes of the object: farther is not looked.
@@ -36,12 +43,20 @@ _REACH_M, _REACH_SIZES = 16.0, 4.0
 #: from nothing.
 _SMALLEST_CELL = 2.0**-12
 
-#: Cubes of one level at most. More are not cut; the bounds are then farther apart than asked.
-_MOST_CELLS = 1 << 17
+#: Cubes of one level at most. More are not cut; the bounds are then farther apart than asked. Fewer
+#: once the hull is certain to reach into the solid: depth is the same all along the middle of a
+#: plate, which may take as many cubes as it is wide and long.
+_MOST_CELLS, _MOST_DEEP_CELLS = 1 << 17, 1 << 14
 
-#: The same once the hull is certain to reach into the solid. Depth is constant all along the middle
-#: of a plate, which takes as many cubes as it is wide and long: it is left less exact.
-_MOST_DEEP_CELLS = 1 << 13
+#: How far apart the bounds at the centre of a cube may be, in tolerances, for the cells within it
+#: to take theirs from its corners.
+_FINE = 1.0 / 8.0
+
+#: Points that look for a deeper one, and how often they move closer together around the deepest.
+_LOOK_POINTS, _LOOKS = 17, 2
+
+#: Halvings of the root at most; cubes are never as small before they are small enough.
+_MOST_LEVELS = 64
 
 #: What rounding in double precision may add to a distance, in lengths of the reach.
 _ROUNDOFF = 64.0 * 2.0**-53
@@ -123,9 +138,9 @@ class ClearanceMeter:
         self._surface = SurfaceDistance(
             vertices_world - self._origin_world, faces, is_closed=is_closed
         )
-        self._octree = DistanceOctree(self._surface)
         self._half_m = float(2.0 ** np.ceil(np.log2(max(_REACH_M, _REACH_SIZES * size_m))))
         self._reach_m = self._half_m - size_m
+        self._lattice = DistanceLattice(self._surface, self._half_m)
 
     def closest(
         self, points_world: NDArray[np.float64]
@@ -164,46 +179,93 @@ class ClearanceMeter:
         shift_world = np.zeros(3) if shift_world is None else shift_world
         origin_world = self._origin_world + shift_world
         asked = make_cell_frame(hull, origin_world, self._half_m)
-        octree, best = self._octree, make_best()
-        if octree.is_large:
-            octree.forget()
-        number, center, half_m = np.zeros(1, np.int64), np.zeros((1, 3)), self._half_m
-        lowest_m = -np.inf
-        while len(number):
+        if self._lattice.is_large:
+            self._lattice.forget()
+        best = Best(np.full(1, np.inf), np.full(3, np.nan))
+        half_m, fine_m = self._half_m, _FINE * self.tolerance_m
+        center, cube = np.zeros((1, 3)), np.zeros(1, np.int64)
+        cubes = self._lattice.cubes(center, half_m, fine_m)
+        dropped_m, lowest_m = np.inf, -np.inf
+        for level in range(1, _MOST_LEVELS):
             half_m /= 2.0
-            octree.make_room(8 * len(number))
-            part, part_center, inside, octree.n_nodes = split_cells(
-                number, center, half_m, octree.first_child, octree.n_nodes, asked
-            )
-            octree.fill(part, part_center)
-            number, center, lowest_m = keep_near(
-                part,
-                part_center,
+            whole, center, inside = split_cells(center, half_m, asked)
+            cube = cube[whole]
+            if level <= FINEST_LEVEL:
+                own = ~cubes.is_fine[cube]
+                cube[own] = len(cubes.half_m) + np.arange(int(own.sum()))
+                cubes = _joined(cubes, self._lattice.cubes(center[own], half_m, fine_m))
+            lower_m, deepest = bound_cells(
+                center,
                 inside,
                 half_m,
-                self.tolerance_m,
-                octree.distance_m,
-                octree.nearest,
-                best,
+                cube,
+                cubes,
+                self._lattice.distance_m,
+                self._lattice.nearest,
                 asked,
+                best,
             )
-            upper_m = best.distance_m[0]
-            lower_m = min(lowest_m, best.distance_m[1], upper_m)
+            if deepest >= 0:
+                self._look_deeper(best, center[deepest], half_m, asked)
+            kept = lower_m < best.distance_m[0] - self.tolerance_m
+            dropped_m = min(dropped_m, lower_m[~kept].min(initial=np.inf))
+            lowest_m = lower_m[kept].min(initial=np.inf)
+            center, cube = center[kept], cube[kept]
             if (
-                np.sqrt(3.0) * half_m < _SMALLEST_CELL * self.tolerance_m
-                or len(number) > (_MOST_CELLS if upper_m >= 0 else _MOST_DEEP_CELLS)
-                or lower_m > stop_above_m
-                or upper_m < stop_below_m
+                len(center) == 0
+                or np.sqrt(3.0) * half_m < _SMALLEST_CELL * self.tolerance_m
+                or len(center) > (_MOST_CELLS if best.distance_m[0] >= 0 else _MOST_DEEP_CELLS)
+                or min(lowest_m, dropped_m, best.distance_m[0]) > stop_above_m
+                or best.distance_m[0] < stop_below_m
             ):
                 break
-        upper_m = float(best.distance_m[0])
-        lower_m = float(min(lowest_m, best.distance_m[1], upper_m, self._reach_m))
+        upper_m, on_object = np.inf, best.point
+        if best.distance_m[0] < np.inf:  # the exact distance of the best point
+            signed_m, nearest = self._surface.signed(best.point[None])
+            upper_m, on_object = float(signed_m[0]), nearest[0]
+        lower_m = float(min(lowest_m, dropped_m, upper_m, self._reach_m))
         lower_m -= _ROUNDOFF * self._half_m
         return Clearance(
             lower_m=max(lower_m, 0.0),
             upper_m=max(upper_m, 0.0),
-            on_object_world=best.points[1] + origin_world,
-            on_hull_world=best.points[0] + origin_world,
+            on_object_world=on_object + origin_world,
+            on_hull_world=best.point + origin_world,
             depth_lower_m=max(-upper_m, 0.0) if self.is_closed else np.nan,
             depth_upper_m=max(-lower_m, 0.0) if self.is_closed else np.nan,
         )
+
+    def _look_deeper(
+        self, best: Best, point: NDArray[np.float64], half_m: float, asked: CellFrame
+    ) -> None:
+        """Follow the way from the surface through a point (3,) of the hull, into the solid.
+
+        The depth grows by a metre a metre until another side of the solid is as near. What is
+        found is taken if it betters the best point; its distance is exact.
+        """
+        signed_m, nearest = self._surface.signed(point[None])
+        away = point - nearest[0]
+        length_m = float(np.linalg.norm(away))
+        if length_m == 0:
+            return
+        away *= np.copysign(1.0, -signed_m[0]) / length_m
+        begin_m, reach_m = 0.0, 2.0 * half_m
+        for _ in range(_LOOKS):
+            along_m = begin_m + reach_m * np.linspace(0.0, 1.0, _LOOK_POINTS)
+            points = point + along_m[:, None] * away
+            inside = are_inside(points, asked)
+            if not inside.any():
+                return
+            signed_m, _ = self._surface.signed(points)
+            signed_m[~inside] = np.inf
+            deepest = int(signed_m.argmin())
+            if signed_m[deepest] < best.distance_m[0]:
+                best.distance_m[0], best.point[:] = signed_m[deepest], points[deepest]
+            reach_m *= 2.0 / (_LOOK_POINTS - 1)
+            begin_m = max(along_m[deepest] - reach_m / 2.0, 0.0)
+
+
+def _joined(first: Cubes, second: Cubes) -> Cubes:
+    """Return the cubes of both, in order."""
+    if len(second.half_m) == 0:
+        return first
+    return Cubes(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))

@@ -1,4 +1,4 @@
-"""Distances to the surface of a CAD object, in double precision, remembered from frame to frame.
+"""Distances to the surface of a CAD object, in double precision.
 
 Distances come from libigl's tree of boxes (`igl.AABB`), which computes in double precision.
 Open3D's `RaycastingScene` computes in single precision and names, on meshes with slivers, triangles
@@ -12,9 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-#: Nodes that are remembered at most, some 70 MB; then all are forgotten, which changes no result.
-_MOST_NODES = 1 << 20
 
 #: Rays that vote on the side; an odd number, three for one that meets an edge.
 _N_RAYS = 3
@@ -103,56 +100,3 @@ class SurfaceDistance:
             open3d.core.Tensor.from_numpy(points.astype(np.float32)), nthreads=1, nsamples=_N_RAYS
         )
         return np.asarray(occupied.numpy() > 0.5)
-
-
-class DistanceOctree:
-    """Signed distances at the centres of the nodes of an octree, computed when first asked for.
-
-    The nodes are cubes about the origin of the surface's frame; node 0 is the root. What is kept
-    depends on the surface alone, so it serves in every frame, wherever the object stands.
-
-    Attributes
-    ----------
-    first_child : (M,) int64
-        The first of a node's eight parts; -1 where it has none.
-    distance_m : (M,) float64
-        Signed distance of a node's centre; NaN where nobody asked.
-    nearest : (M, 3) float64
-        The point of the surface that is nearest to it.
-    n_nodes : int
-        How many nodes there are; the arrays have room for more.
-    """
-
-    def __init__(self, surface: SurfaceDistance) -> None:
-        self._surface = surface
-        self.forget()
-
-    def forget(self) -> None:
-        """Start again with the root."""
-        room = 1 << 12
-        self.first_child = np.full(room, -1, np.int64)
-        self.distance_m = np.full(room, np.nan)
-        self.nearest = np.full((room, 3), np.nan)
-        self.n_nodes = 1
-
-    @property
-    def is_large(self) -> bool:
-        """Whether it is time to forget."""
-        return self.n_nodes > _MOST_NODES
-
-    def make_room(self, n_more: int) -> None:
-        """Provide for that many nodes more."""
-        needed, room = self.n_nodes + n_more, len(self.first_child)
-        if needed <= room:
-            return
-        grown = max(needed, 2 * room) - room
-        self.first_child = np.concatenate([self.first_child, np.full(grown, -1, np.int64)])
-        self.distance_m = np.concatenate([self.distance_m, np.full(grown, np.nan)])
-        self.nearest = np.concatenate([self.nearest, np.full((grown, 3), np.nan)])
-
-    def fill(self, number: NDArray[np.int64], center: NDArray[np.float64]) -> None:
-        """Compute the distances of nodes (N,) with centres (N, 3) that are not known yet."""
-        unknown = np.isnan(self.distance_m[number])
-        if unknown.any():
-            asked = number[unknown]
-            self.distance_m[asked], self.nearest[asked] = self._surface.signed(center[unknown])

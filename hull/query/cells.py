@@ -38,9 +38,6 @@ _NEAR = 1000.0 * 2.0**-53
 #: A point this near to the edge of a pixel, in pixels, is not called inside.
 _EDGE_PX = 1e-7
 
-#: The tries that a centre in the hull makes towards the surface, in halves of its cube's edge.
-_TRIES = (1.0, 0.5, 0.25)
-
 
 class CellFrame(NamedTuple):
     """The hull of one frame, asked about cells.
@@ -72,28 +69,8 @@ def make_cell_frame(hull: Hull, origin_world: NDArray[np.float64], reach_m: floa
     return CellFrame(frame, _PAD * largest, offset_local)
 
 
-class Best(NamedTuple):
-    """The hull's point nearest to the surface that was found so far, all in the cells' frame.
-
-    Attributes
-    ----------
-    distance_m : (2,) float64
-        Its signed distance; and the smallest lower bound of a cell that was dropped.
-    points : (2, 3) float64
-        The point, and the point of the surface nearest to it.
-    """
-
-    distance_m: NDArray[np.float64]
-    points: NDArray[np.float64]
-
-
-def make_best() -> Best:
-    """Return what is known before anything was asked: no point, nothing dropped."""
-    return Best(np.full(2, np.inf), np.full((2, 3), np.nan))
-
-
 @compiled
-def _is_inside(
+def is_inside(
     x: float,
     y: float,
     z: float,
@@ -126,6 +103,26 @@ def _is_inside(
         if not keep:
             return False
     return not keep or n_seen >= min_cameras
+
+
+@compiled
+def are_inside(points: NDArray[np.float64], asked: CellFrame) -> NDArray[np.bool_]:
+    """Tell which points (N, 3), cells' frame, are in the hull and clear of all edges of pixels."""
+    frame, offset = asked.frame, asked.offset_local
+    inside = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        inside[i] = is_inside(
+            points[i, 0] + offset[0],
+            points[i, 1] + offset[1],
+            points[i, 2] + offset[2],
+            frame.matrices,
+            frame.sizes,
+            frame.masks,
+            frame.mask_offset,
+            frame.keep,
+            frame.min_cameras,
+        )
+    return inside
 
 
 @compiled
@@ -167,57 +164,38 @@ def _is_beside(
 
 @compiled
 def split_cells(
-    number: NDArray[np.int64],
-    center: NDArray[np.float64],
-    half_m: float,
-    first_child: NDArray[np.int64],
-    n_nodes: int,
-    asked: CellFrame,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], int]:
+    center: NDArray[np.float64], half_m: float, asked: CellFrame
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
     """Cut cells into eight and return the parts that are not proved free.
 
     Parameters
     ----------
-    number : (N,) int64
-        The cells' nodes in the octree.
     center : (N, 3) float64
-        Their centres, metres, in the cells' frame.
+        The cells' centres, metres, in the cells' frame.
     half_m : float
         Half of an edge of the parts.
-    first_child : (M,) int64
-        Per node of the octree the first of its eight parts, -1 where it has none yet; there is room
-        for all. Written.
-    n_nodes : int
-        How many nodes the octree has.
     asked : CellFrame
         The hull.
 
     Returns
     -------
-    number : (K,) int64
-        The nodes of the parts.
+    whole : (K,) int64
+        The cell that each part is of, ascending.
     center : (K, 3) float64
-        Their centres.
+        The centres of the parts.
     inside : (K,) bool
-        Which centres are in the hull.
-    n_nodes : int
-        How many nodes the octree has now.
+        Which of these are in the hull.
     """
     frame, pads = asked.frame, asked.pads
     offset_x, offset_y, offset_z = asked.offset_local
     matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
     masks, mask_offset, integral_offset = frame.masks, frame.mask_offset, frame.integral_offset
     keep, min_cameras, n_cameras = frame.keep, frame.min_cameras, len(frame.matrices)
-    part = np.zeros(8 * len(number), np.int64)
-    part_center = np.zeros((8 * len(number), 3))
-    inside = np.zeros(8 * len(number), np.bool_)
+    whole = np.zeros(8 * len(center), np.int64)
+    part_center = np.zeros((8 * len(center), 3))
+    inside = np.zeros(8 * len(center), np.bool_)
     n_parts = 0
-    for i in range(len(number)):
-        first = first_child[number[i]]
-        if first < 0:
-            first = n_nodes
-            first_child[number[i]] = first
-            n_nodes += 8
+    for i in range(len(center)):
         for octant in range(8):
             cell_x = center[i, 0] + (half_m if octant & 1 else -half_m)
             cell_y = center[i, 1] + (half_m if octant & 2 else -half_m)
@@ -289,109 +267,12 @@ def split_cells(
                     n_left += 1
             if is_free or (keep and n_accept + n_left < min_cameras):
                 continue
-            part[n_parts] = first + octant
+            whole[n_parts] = i
             part_center[n_parts, 0] = cell_x
             part_center[n_parts, 1] = cell_y
             part_center[n_parts, 2] = cell_z
-            inside[n_parts] = _is_inside(
+            inside[n_parts] = is_inside(
                 x, y, z, matrices, sizes, masks, mask_offset, keep, min_cameras
             )
             n_parts += 1
-    return part[:n_parts], part_center[:n_parts], inside[:n_parts], n_nodes
-
-
-@compiled
-def keep_near(
-    number: NDArray[np.int64],
-    center: NDArray[np.float64],
-    inside: NDArray[np.bool_],
-    half_m: float,
-    tolerance_m: float,
-    distance_m: NDArray[np.float64],
-    nearest: NDArray[np.float64],
-    best: Best,
-    asked: CellFrame,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
-    """Take note of the hull's nearest point, and drop the cells that cannot hold a nearer one.
-
-    The signed distance to the surface changes by at most one metre a metre, so that no point of a
-    cell is nearer than its centre less half a diagonal.
-
-    Parameters
-    ----------
-    number, center, inside, half_m
-        Cells that are not free, as `split_cells` returns them.
-    tolerance_m : float
-        A cell that can better the best distance by no more than this is dropped.
-    distance_m : (M,) float64
-        Signed distances of the nodes' centres, negative inside the solid, metres.
-    nearest : (M, 3) float64
-        The points of the surface nearest to the nodes' centres, in the cells' frame.
-    best : Best
-        Written.
-    asked : CellFrame
-        The hull.
-
-    Returns
-    -------
-    number : (K,) int64
-    center : (K, 3) float64
-        The cells that are kept.
-    lowest_m : float
-        The smallest lower bound among them; inf if there is none.
-    """
-    frame = asked.frame
-    offset_x, offset_y, offset_z = asked.offset_local
-    matrices, sizes, masks, mask_offset = (
-        frame.matrices,
-        frame.sizes,
-        frame.masks,
-        frame.mask_offset,
-    )
-    keep, min_cameras = frame.keep, frame.min_cameras
-    smallest_m = best.distance_m[0]
-    for i in range(len(number)):
-        node = number[i]
-        if not inside[i] or distance_m[node] - half_m >= smallest_m:
-            continue
-        x, y, z, s = center[i, 0], center[i, 1], center[i, 2], distance_m[node]
-        to_x, to_y, to_z = nearest[node, 0] - x, nearest[node, 1] - y, nearest[node, 2] - z
-        way = 0.0
-        if s > 0:  # on the way to the nearest point of the surface, each metre brings a metre
-            for share in _TRIES:
-                along = min(share * half_m / s, 1.0)
-                if _is_inside(
-                    x + along * to_x + offset_x,
-                    y + along * to_y + offset_y,
-                    z + along * to_z + offset_z,
-                    matrices,
-                    sizes,
-                    masks,
-                    mask_offset,
-                    keep,
-                    min_cameras,
-                ):
-                    way = along
-                    break
-        if s - way * s < smallest_m:
-            smallest_m = s - way * s
-            best.points[0, 0] = x + way * to_x
-            best.points[0, 1] = y + way * to_y
-            best.points[0, 2] = z + way * to_z
-            for axis in range(3):
-                best.points[1, axis] = nearest[node, axis]
-    best.distance_m[0] = smallest_m
-    kept, kept_center = np.zeros(len(number), np.int64), np.zeros((len(number), 3))
-    n_kept, lowest_m, dropped_m = 0, np.inf, best.distance_m[1]
-    for i in range(len(number)):
-        lower_m = distance_m[number[i]] - np.sqrt(3.0) * half_m
-        if lower_m >= smallest_m - tolerance_m:
-            dropped_m = min(dropped_m, lower_m)
-            continue
-        lowest_m = min(lowest_m, lower_m)
-        kept[n_kept] = number[i]
-        for axis in range(3):
-            kept_center[n_kept, axis] = center[i, axis]
-        n_kept += 1
-    best.distance_m[1] = dropped_m
-    return kept[:n_kept], kept_center[:n_kept], lowest_m
+    return whole[:n_parts], part_center[:n_parts], inside[:n_parts]

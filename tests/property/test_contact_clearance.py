@@ -42,8 +42,7 @@ class Box:
 @pytest.mark.parametrize("seed", range(20))
 def test_bounds_hold_the_exact_distance_of_convex_hulls(seed: int) -> None:
     rng = np.random.default_rng([4, seed])
-    n_apart = n_inside = 0
-    widths: list[float] = []
+    n_apart = n_inside = n_wide = 0
     while n_apart + n_inside < 100:
         views = random_views(rng, int(rng.integers(3, 6)))
         made = rectangle_hull(rng, views, 0.2 * rng.normal(size=3))
@@ -58,7 +57,7 @@ def test_bounds_hold_the_exact_distance_of_convex_hulls(seed: int) -> None:
         assert found.upper_m - found.lower_m <= tolerance_m + 1e-9
         if depth > 1e-8:
             n_inside += 1
-            widths.append(found.depth_upper_m - found.depth_lower_m)
+            n_wide += bool(found.depth_upper_m - found.depth_lower_m > tolerance_m + 1e-9)
             assert found.lower_m == 0
             assert found.depth_lower_m - 1e-8 <= depth <= found.depth_upper_m + 1e-8
         else:
@@ -76,7 +75,7 @@ def test_bounds_hold_the_exact_distance_of_convex_hulls(seed: int) -> None:
         between = np.linalg.norm(found.on_hull_world - found.on_object_world)
         assert between == pytest.approx(abs(signed), abs=1e-9)
     assert min(n_apart, n_inside) > 10
-    assert np.median(widths) <= 1e-3  # a depth that is the same all along a plate is not as exact
+    assert n_wide <= 0.1 * n_inside + 2  # all along the middle of a plate depth is left less exact
 
 
 def _random_hull(rng: np.random.Generator) -> Hull:
@@ -119,16 +118,15 @@ def test_cells_that_are_dropped_hold_no_point_of_the_hull(seed: int) -> None:
         half_m = float(10.0 ** rng.uniform(-2.5, 0.5))
         center = rng.normal(size=(40, 3)) * 0.4
         asked = make_cell_frame(hull, hull.views.origin_world, 10.0)
-        children = np.full(1000, -1, np.int64)
-        part, part_center, inside, n_nodes = split_cells(
-            np.arange(40), center, half_m, children, 40, asked
-        )
-        assert n_nodes == 40 + 8 * 40
+        whole, part_center, inside = split_cells(center, half_m, asked)
+        assert (np.diff(whole) >= 0).all()
         octants = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
-        octants = octants[:, ::-1]  # x changes first
-        everywhere = (center[:, None] + half_m * octants).reshape(-1, 3)
-        np.testing.assert_allclose(part_center, everywhere[part - 40], atol=1e-12)
-        dropped = np.setdiff1d(np.arange(320), part - 40)
+        everywhere = (center[:, None] + half_m * octants[:, ::-1]).reshape(-1, 3)  # x changes first
+        apart = np.abs(part_center[:, None] - everywhere).max(axis=2)  # (K, 320)
+        part = apart.argmin(axis=1)
+        assert (apart.min(axis=1) < 1e-12).all()
+        np.testing.assert_array_equal(part // 8, whole)
+        dropped = np.setdiff1d(np.arange(320), part)
         n_dropped += len(dropped)
         points = everywhere[dropped][:, None] + half_m * rng.uniform(-1, 1, (len(dropped), 50, 3))
         corners = everywhere[dropped][:, None] + half_m * octants
