@@ -110,6 +110,8 @@ def test_a_finer_accuracy_takes_smaller_steps_and_says_so(
     assert run("detect", session, "--scene", scene, "-o", path, "--accuracy-mm", 5) == 0
 
     about = read_report(path).objects["hit"].about
+    assert about["closed"] is True
+    assert json.loads(about["material"]) == {"name": None, "rgba": None}
     assert about["sample_spacing_m"] <= 0.005
     # The longest edge is a diagonal of 0.2 sqrt(2) m: 57 steps of 5 mm, 58 samples.
     assert about["largest_viewport"] == 58
@@ -268,11 +270,54 @@ def test_masks_of_another_size_than_the_others_are_a_row_with_a_reason(
         ["detect", "s", "--scene", "x", "-o", "r.h5", "--frames", "x"],
         ["detect", "s", "--scene", "x", "-o", "r.h5", "--viewport", "0"],
         ["detect", "s", "--scene", "x", "-o", "r.h5", "--viewport", "3", "--accuracy-mm", "3"],
+        ["detect", "s", "--scene", "x", "-o", "r.h5", "--abc-deg", "180"],
+        ["detect", "s", "--scene", "x", "-o", "r.h5", "--clearance-mm", "-1"],
+        ["detect", "s", "--scene", "x", "-o", "r.h5", "--backtrack", "--no-response"],
+        ["detect", "s", "-o", "r.h5"],
         ["no-such-command"],
     ],
 )
 def test_wrong_usage_is_status_2(run: Run, arguments: list[str]) -> None:
     assert run(*arguments) == 2
+
+
+def test_options_of_contact_are_kept_and_options_left_out_leave_columns_out(
+    run: Run, tmp_path: Path, session: Path, scene: Path
+) -> None:
+    full, lean = tmp_path / "full.h5", tmp_path / "lean.h5"
+    common = ("detect", session, "--scene", scene, "--frames", "5:7", "--no-progress")
+    chosen = ("--clearance-mm", 1, "--abc-mm", 40, "--abc-window", 100, "--mask-std-px", 0.5)
+
+    assert run(*common, "-o", full, *chosen, "--abc-deg", 20, "--backtrack") == 0
+    assert run(*common, "-o", lean, "--no-response", "--no-doubt") == 0
+
+    report = read_report(full)
+    settings = report.settings
+    assert settings["clearance_m"] == 0.001
+    assert settings["response"]["angle_rad"] == pytest.approx(np.radians(20))
+    assert settings["response"]["height_m"] == 0.04
+    assert settings["response"]["window"] == 100
+    assert settings["backtrack"] is True
+    assert settings["doubt"]["segmentation_px"] == 0.5
+    hit, other = report.objects["hit"], read_report(lean).objects["hit"]
+    assert {"clearance_m", "d_rec_m", "first_contact_s", "survives"} <= hit.columns.keys()
+    assert {"clearance_m", "first_contact_s"} <= other.columns.keys()
+    assert not {"d_rec_m", "survives"} & other.columns.keys()
+    width_m = np.diff(report.objects["far"]["clearance_m"], axis=1)
+    assert (width_m <= 0.001 + 1e-9).all()
+
+
+def test_json_of_detect_is_that_of_summary(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "report.h5"
+    call = ("detect", session, "--scene", scene, "-o", path, "--frames", "5:7", "--no-doubt")
+
+    assert run(*call, "--json") == 0
+
+    told = json.loads(capsys.readouterr().out)
+    assert run("summary", path, "--json") == 0
+    assert json.loads(capsys.readouterr().out) == told
 
 
 def test_summary_counts_what_the_report_holds(
