@@ -10,7 +10,13 @@ and how much room the task needs.
 
 from hybridve.hull.capture.synth.presets import BOXES_PASSING_CLEARANCE_M, PRESETS
 from hybridve.hull.capture.synth.stage import Preset
-from hybridve.hull.capture.synth.truth import ObjectTruth, Truth, read_truth, true_masks
+from hybridve.hull.capture.synth.truth import (
+    ObjectTruth,
+    SpacingTruth,
+    Truth,
+    read_truth,
+    true_masks,
+)
 from hybridve.hull.capture.synth.write import write_session
 
 __all__ = [
@@ -18,6 +24,7 @@ __all__ = [
     "PRESETS",
     "ObjectTruth",
     "Preset",
+    "SpacingTruth",
     "Truth",
     "read_truth",
     "true_masks",
