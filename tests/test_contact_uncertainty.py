@@ -157,7 +157,7 @@ def test_the_true_hull_is_at_least_so_far_away_in_95_percent_of_recordings() -> 
         for _ in range(25):
             hull = _disturbed(rng, views, center, radius_m, **errors_px)
             clearance = meter.measure(hull)
-            found = Doubter(errors).frame(hull)._sensitivity(meter, clearance)[0]
+            found = Doubter(errors).frame(hull).sensitivity(meter, clearance)[0]
             std_m = float(np.linalg.norm(found * errors.sigma_px))
             covered.append(clearance.lower_m - ONE_SIDED_95 * std_m <= 0.15)
             pulls.append((clearance.upper_m - 0.15) / std_m)

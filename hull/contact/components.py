@@ -2,10 +2,10 @@
 
 A visual hull holds all that could be there: where rays of different things cross, volumes arise
 that hold nothing (phantom volumes). What can be proved is the contrary. Let the silhouettes be
-right: an object pixel's ray meets something real, and whatever is real lies in the hull. Then an
-object pixel whose ray meets one volume of the hull and no other proves that this volume holds
-something real. A volume of which every pixel has another volume behind or before it may be a
-phantom; it need not be one.
+right: an object pixel's ray meets something real, and whatever is real lies in the hull (so it
+stands where as many cameras see it as the hull asks for). Then an object pixel whose ray meets one
+volume of the hull and no other proves that this volume holds something real. A volume of which
+every pixel has another volume behind or before it may be a phantom; it need not be one.
 
 Silhouettes are sampled at the centres of pixels, so a real thing can stick out of their hull by a
 part of a pixel. Everything here is therefore asked of the hull whose silhouettes are grown by one
@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
 from hybridve.hull.query.walk import spans_in_hull
 
@@ -64,8 +65,9 @@ _ROUNDING_PX = 1e-6
 #: Coverage is drawn in blocks of so many pixels a side.
 _BLOCK_PX = 4
 
-#: Rays that are walked to prove one volume, at most: one in right silhouettes does.
-_MOST_RAYS = 16
+#: To prove one volume, points are sought in at most so many of its cells, as many along each edge
+#: of a cell, and so many rays of a camera are walked: in right silhouettes the first ray does.
+_MOST_CELLS_TRIED, _CELL_POINTS, _MOST_RAYS = 32, 4, 4
 
 #: As far as a ray is walked.
 FAR_M = 1e3
@@ -385,8 +387,8 @@ def _blocks(
 def is_real(hull: Hull, volumes: Volumes, coverage: Coverage, volume: int) -> bool:
     """Tell whether right silhouettes prove that a volume holds something real.
 
-    Object pixels in blocks that no other volume covers are tried until one's ray is in the hull,
-    and in this volume wherever it is.
+    Points of the volume are projected. Where one falls on an object pixel in a block that no other
+    volume covers, the pixel's ray is walked: it must be in the hull, and only in this volume.
 
     Parameters
     ----------
@@ -397,26 +399,44 @@ def is_real(hull: Hull, volumes: Volumes, coverage: Coverage, volume: int) -> bo
     volume : int
         The one asked about, from 0.
     """
-    per_camera = max(1, _MOST_RAYS // len(hull.views))
+    points_world = _points_within(volumes, volume)
     for camera in range(len(hull.views)):
-        blocks = np.argwhere((coverage.sole[camera] == volume) & _has_object(hull, camera))
-        chosen = np.linspace(0, len(blocks) - 1, min(per_camera, len(blocks)))
-        for row, column in (blocks[chosen.round().astype(np.int64)] * _BLOCK_PX).tolist():
-            block = hull.mask(camera)[row : row + _BLOCK_PX, column : column + _BLOCK_PX]
-            inner_row, inner_column = np.argwhere(block)[0].tolist()
-            if _is_all_in(volumes, camera, column + inner_column, row + inner_row, volume):
+        tried = _object_pixels(hull, camera, points_world)
+        row, column = tried.T
+        tried = tried[coverage.sole[camera][row // _BLOCK_PX, column // _BLOCK_PX] == volume]
+        for row, column in _evenly(tried, _MOST_RAYS).tolist():
+            if _is_all_in(volumes, camera, column, row, volume):
                 return True
     return False
 
 
-def _has_object(hull: Hull, camera: int) -> NDArray[np.bool_]:
-    """Tell which blocks of an image hold an object pixel, (H', W')."""
-    integral = hull.integral(camera)
-    height, width = integral.shape
-    rows = np.append(np.arange(0, height - 1, _BLOCK_PX), height - 1)
-    columns = np.append(np.arange(0, width - 1, _BLOCK_PX), width - 1)
-    corners = integral[np.ix_(rows, columns)]
-    return np.asarray(np.diff(np.diff(corners, axis=0), axis=1) > 0)
+def _points_within(volumes: Volumes, volume: int) -> NDArray[np.float64]:
+    """Return points of a volume that are in the hull, (N, 3) metres, world frame."""
+    cells = _evenly(np.argwhere(volumes.number == volume + 1), _MOST_CELLS_TRIED) + volumes.first
+    inner = (np.indices((_CELL_POINTS,) * 3).reshape(3, -1).T + 0.5) / _CELL_POINTS
+    points_local = (cells[:, None] + inner).reshape(-1, 3) * volumes.cell_m
+    points_world = np.asarray(points_local + volumes.hull.views.origin_world)
+    return points_world[contains_points(volumes.hull, points_world)]
+
+
+def _object_pixels(hull: Hull, camera: int, points_world: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the object pixels (N, 2) that points (P, 3) project to: rows, columns, ascending."""
+    matrix = hull.views.img_from_local[camera]
+    mask = hull.mask(camera)
+    h = (points_world - hull.views.origin_world) @ matrix[:, :3].T + matrix[:, 3]
+    h = h[h[:, 2] > 0]
+    with np.errstate(over="ignore"):
+        pixels = np.clip(h[:, 1::-1] / h[:, 2:], -1, mask.shape)
+    pixels = np.unique(np.floor(pixels).astype(np.int64), axis=0)
+    pixels = pixels[((pixels >= 0) & (pixels < mask.shape)).all(axis=1)]
+    return np.asarray(pixels[mask[tuple(pixels.T)] > 0])
+
+
+def _evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return at most so many rows of an array, evenly chosen."""
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]
 
 
 def _is_all_in(volumes: Volumes, camera: int, column: int, row: int, volume: int) -> bool:

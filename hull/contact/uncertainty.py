@@ -55,16 +55,16 @@ corners were missed stands in for it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from hybridve.hull.contact.bulge import real_upper
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.components import (
     CELL_M,
-    FAR_M,
     NOWHERE,
     Coverage,
     Volumes,
@@ -72,12 +72,11 @@ from hybridve.hull.contact.components import (
     cover,
     grown,
     is_real,
-    pixel_ray,
 )
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views
-from hybridve.hull.query.walk import silhouette_normal, spans_in_hull
+from hybridve.hull.query.walk import silhouette_normal
 
 #: One-sided 95 % of a normal distribution, in standard deviations.
 ONE_SIDED_95 = 1.645
@@ -92,19 +91,6 @@ _MOST_RESIDUAL = 0.35
 
 #: Nearer than this there is no direction from the hull to the object.
 _NO_DIRECTION_M = 1e-7
-
-#: Where rays are tried for a bound of the real thing's distance: at the nearest point's projection,
-#: and in the most promising cameras at these distances about it, in eight directions.
-_RINGS_PX = (2.5, 7.0)
-_AROUND = np.array([(np.cos(k * np.pi / 4.0), np.sin(k * np.pi / 4.0)) for k in range(8)])
-_CLOSE_CAMERAS = 2
-
-#: So many of these rays, the most promising, are measured closely; to this many metres.
-_CLOSE_RAYS = 6
-_CLOSE_M = 1e-3
-
-#: Rounds of halving a ray's steps, and steps of the first.
-_MOST_ROUNDS, _FIRST_STEPS = 12, 8
 
 #: Collision points that are asked whether they stand without a camera.
 _MOST_POINTS = 4096
@@ -212,8 +198,8 @@ class Doubt:
     ----------
     std_m : float
         Estimate: standard deviation of the clearance (of the depth, where the hull reaches into a
-        closed object). NaN where no clearance is known, or there is no direction from the hull to
-        the surface.
+        closed object; 0 where it covers the object's innermost point, so that no outline matters).
+        NaN where no clearance is known, or there is no direction from the hull to the surface.
     at_least_m : float
         Estimate: what the clearance is at least, at 95 %; not below 0. NaN with `std_m`.
     real_upper_m : float
@@ -308,7 +294,7 @@ class FrameDoubts:
         clearance : Clearance
             Of the object in this frame.
         """
-        sensitivity_m, is_remeasured = self._sensitivity(meter, clearance)
+        sensitivity_m, is_remeasured = self.sensitivity(meter, clearance)
         std_m = float(np.sqrt(((sensitivity_m * self.errors.sigma_px) ** 2).sum()))
         points_world = _touching_points(contact)
         if len(points_world):
@@ -333,7 +319,7 @@ class FrameDoubts:
             component=self._component(points_world),
         )
 
-    def _sensitivity(
+    def sensitivity(
         self, meter: ClearanceMeter, clearance: Clearance
     ) -> tuple[NDArray[np.float64], bool]:
         """Return metres per pixel (C,), and whether they were measured anew."""
@@ -537,142 +523,3 @@ def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64
     beyond_ends = views.unseen == "carve"
     is_background = np.where(is_within, value == 0, beyond_ends)
     return bool((is_near & is_background).any())
-
-
-def real_upper(hull: Hull, grown_hull: Hull, meter: ClearanceMeter, clearance: Clearance) -> float:
-    """Return how far away from the object the real thing is at most, given right silhouettes.
-
-    The ray of an object pixel's centre meets something real, in the hull of silhouettes grown by
-    one pixel. So something real is no farther away than the farthest point of that ray in that
-    hull; any ray gives a bound. Rays of pixels about the hull's nearest point are tried.
-
-    Along a ray distances change by at most a metre a metre: between two points ``step`` apart at
-    distances a and b there is none above (a + b + step) / 2.
-
-    Parameters
-    ----------
-    hull, grown_hull : Hull
-        Of one frame; see `hybridve.hull.contact.components.grown`.
-    meter : ClearanceMeter
-        Of the object.
-    clearance : Clearance
-        Of the object in this frame.
-
-    Returns
-    -------
-    float
-        Metres, not below the clearance's lower bound; 0 if it certainly reaches into a closed
-        object, inf if there is no ray.
-    """
-    if not np.isfinite(clearance.on_hull_world).all():
-        return np.inf
-
-    def promises(asked: list[tuple[int, int, int]]) -> list[_Promise]:
-        return [
-            _Promise(promise_m, camera, ray)
-            for camera, column, row in asked
-            if (ray := _walk_pixel(grown_hull, camera, column, row)) is not None
-            for promise_m in [float(meter.signed_distance(ray.ends_world).max())]
-        ]
-
-    pixels = [
-        _pixels_about(hull, camera, clearance.on_hull_world) for camera in range(len(hull.views))
-    ]
-    tried = promises([(camera, *found[0]) for camera, found in enumerate(pixels) if found])
-    best = sorted(tried, key=lambda promise: promise.at_least_m)[:_CLOSE_CAMERAS]
-    tried += promises([(p.camera, *pixel) for p in best for pixel in pixels[p.camera][1:]])
-    bound_m = np.inf
-    for promise in sorted(tried, key=lambda promise: promise.at_least_m)[:_CLOSE_RAYS]:
-        if promise.at_least_m >= bound_m:
-            break
-        bound_m = min(bound_m, _farthest(meter, promise.ray, bound_m))
-    return max(bound_m, clearance.lower_m)
-
-
-class _Ray(NamedTuple):
-    """A pixel's ray, and the stretches (N, 2) of it that lie in the hull, metres."""
-
-    origin_world: NDArray[np.float64]
-    direction: NDArray[np.float64]
-    spans_m: NDArray[np.float64]
-
-    def at(self, along_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return points (K, 3), metres."""
-        return self.origin_world + along_m[:, None] * self.direction
-
-    @property
-    def ends_world(self) -> NDArray[np.float64]:
-        """Where its stretches begin and end, (2 N, 3) metres."""
-        return self.at(self.spans_m.ravel())
-
-
-class _Promise(NamedTuple):
-    """What a ray's bound is not below, metres: the farther of its ends."""
-
-    at_least_m: float
-    camera: int
-    ray: _Ray
-
-
-def _walk_pixel(grown_hull: Hull, camera: int, column: int, row: int) -> _Ray | None:
-    """Return the ray of a pixel; None where the silhouettes contradict each other."""
-    origin_world, direction = pixel_ray(grown_hull.views, camera, column, row)
-    spans_m = spans_in_hull(grown_hull, origin_world, direction, FAR_M)
-    return _Ray(origin_world, direction, spans_m) if len(spans_m) else None
-
-
-def _pixels_about(
-    hull: Hull, camera: int, point_world: NDArray[np.float64]
-) -> list[tuple[int, int]]:
-    """Return object pixels, columns and rows, at and about the projection of a point, in turn."""
-    views = hull.views
-    matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
-    width, height = views.sizes_px[camera].tolist()
-    if not projected[2] > 0:
-        return []
-    with np.errstate(over="ignore"):
-        middle = projected[:2] / projected[2]
-    if not ((middle >= 0) & (middle < (width, height))).all():
-        return []
-    asked = [middle] + [middle + ring * around for ring in _RINGS_PX for around in _AROUND]
-    mask = hull.mask(camera)
-    found = []
-    for column, row in np.floor(asked).astype(np.int64).tolist():
-        is_seen = 0 <= column < width and 0 <= row < height
-        if is_seen and mask[row, column] and (column, row) not in found:
-            found.append((column, row))
-    return found
-
-
-def _farthest(meter: ClearanceMeter, ray: _Ray, enough_m: float) -> float:
-    """Return a bound of the signed distance along stretches of a ray, to `_CLOSE_M`.
-
-    It is given up, with infinity, where it is certainly above `enough_m`.
-    """
-    begin, end = ray.spans_m.T
-    steps = np.linspace(begin, end, _FIRST_STEPS + 1, axis=1)  # (N, K)
-    distances_m = meter.signed_distance(ray.at(steps.ravel())).reshape(steps.shape)
-    begin, end = steps[:, :-1].ravel(), steps[:, 1:].ravel()
-    at_begin, at_end = distances_m[:, :-1].ravel(), distances_m[:, 1:].ravel()
-    reached_m = float(distances_m.max())
-    settled_m = -np.inf
-    for _ in range(_MOST_ROUNDS):
-        upper_m = 0.5 * (at_begin + at_end + (end - begin))
-        is_open = upper_m > reached_m + _CLOSE_M
-        settled_m = max(settled_m, float(upper_m[~is_open].max(initial=-np.inf)))
-        if not is_open.any():
-            return settled_m
-        if reached_m >= enough_m:
-            return np.inf
-        begin, end = begin[is_open], end[is_open]
-        at_begin, at_end = at_begin[is_open], at_end[is_open]
-        middle = 0.5 * (begin + end)
-        at_middle = meter.signed_distance(ray.at(middle))
-        reached_m = max(reached_m, float(at_middle.max()))
-        begin, end = np.concatenate([begin, middle]), np.concatenate([middle, end])
-        at_begin, at_end = (
-            np.concatenate([at_begin, at_middle]),
-            np.concatenate([at_middle, at_end]),
-        )
-    return max(settled_m, float((0.5 * (at_begin + at_end + (end - begin))).max()))

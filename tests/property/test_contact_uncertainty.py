@@ -8,13 +8,16 @@ from helpers.hulls import ball_masks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridve.hull.contact.bulge import Ray, farthest_on, real_upper
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
 from hybridve.hull.contact.detect import Contact
-from hybridve.hull.contact.uncertainty import Doubter, outline_errors, real_upper
+from hybridve.hull.contact.uncertainty import Doubter, outline_errors
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
 BOX_HALF_M = 0.1
+
+seeds = st.integers(0, 2**32 - 1)
 
 
 @cache
@@ -24,29 +27,27 @@ def meter() -> ClearanceMeter:
     )
 
 
-@st.composite
-def balls(draw: st.DrawFn) -> tuple[Hull, np.ndarray, float]:
-    """One to three balls beside or in a box, seen by 2 to 5 cameras anywhere; the first's truth."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    n_cameras, n_balls = draw(st.integers(2, 5)), draw(st.integers(1, 3))
+def hull_beside_box(seed: int, n_cameras: int, n_balls: int) -> tuple[Hull, float]:
+    """Return the hull of balls beside or in the box, and how far the nearest ball truly is."""
+    rng = np.random.default_rng(seed)
     centers = rng.normal(size=(n_cameras, 3))
     centers *= rng.uniform(2.0, 3.5, (n_cameras, 1)) / np.linalg.norm(centers, axis=1)[:, None]
-    views = views_from(list(centers), 240, 200, 200.0)
+    views = views_from(list(centers), 160, 128, 130.0)
     masks, nearest_m = [], np.inf
     for _ in range(n_balls):
         center, radius_m = rng.uniform(-0.35, 0.35, 3), float(rng.uniform(0.05, 0.15))
         masks.append(ball_masks(views, center, radius_m))
         nearest_m = min(nearest_m, float(meter().signed_distance(center[None])[0]) - radius_m)
     seen = [np.maximum.reduce(of_camera) for of_camera in zip(*masks, strict=True)]
-    return make_hull(views, seen), centers, max(nearest_m, 0.0)
+    return make_hull(views, seen), max(nearest_m, 0.0)
 
 
 @settings(max_examples=200)
-@given(scene=balls())
+@given(seed=seeds, n_cameras=st.integers(2, 5), n_balls=st.integers(1, 3))
 def test_the_real_thing_is_not_farther_away_than_the_bound(
-    scene: tuple[Hull, np.ndarray, float],
+    seed: int, n_cameras: int, n_balls: int
 ) -> None:
-    hull, _, nearest_m = scene
+    hull, nearest_m = hull_beside_box(seed, n_cameras, n_balls)
     clearance = meter().measure(hull)
 
     bound_m = real_upper(hull, grown(hull), meter(), clearance)
@@ -56,12 +57,29 @@ def test_the_real_thing_is_not_farther_away_than_the_bound(
     assert np.isfinite(bound_m)
 
 
-@settings(max_examples=25)
-@given(scene=balls())
+@settings(max_examples=50)
+@given(seed=seeds)
+def test_the_farthest_point_of_a_ray_is_bounded_closely(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=3)
+    ends_m = np.sort(rng.uniform(0.0, 1.2, 2 * int(rng.integers(1, 4)))).reshape(-1, 2)
+    ray = Ray(rng.uniform(-0.5, 0.5, 3), direction / np.linalg.norm(direction), ends_m)
+    within_m = np.linspace(*ends_m.T, 2001, axis=1).ravel()
+
+    bound_m = farthest_on(meter(), ray, np.inf)
+
+    farthest_m = meter().signed_distance(ray.at(within_m)).max()
+    assert farthest_m <= bound_m + 1e-12
+    assert bound_m <= farthest_m + 2e-3
+    assert farthest_on(meter(), ray, farthest_m - 0.01) in (bound_m, np.inf)
+
+
+@settings(max_examples=10)
+@given(seed=seeds, n_cameras=st.integers(2, 5), n_balls=st.integers(1, 3))
 def test_a_doubt_does_not_depend_on_what_was_doubted_before(
-    scene: tuple[Hull, np.ndarray, float],
+    seed: int, n_cameras: int, n_balls: int
 ) -> None:
-    hull, _, _ = scene
+    hull, _ = hull_beside_box(seed, n_cameras, n_balls)
     free = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
     doubter = Doubter(outline_errors(hull.views.names, {}, [0.0] * len(hull.views)))
     fresh = ClearanceMeter(
