@@ -250,8 +250,8 @@ def test_of_equally_far_points_the_first_in_x_y_z_is_chosen_whatever_their_order
         chosen = collision_point(contact, np.zeros(3))
 
         np.testing.assert_array_equal(chosen, [-0.125, -0.125, -0.125])
-    upper = contact_at((0.5, -0.25, 0.5), (0.5, 0.25, -0.5), (0.5, -0.25, -0.5))
-    np.testing.assert_array_equal(collision_point(upper, np.zeros(3)), [0.5, -0.25, -0.5])
+    mixed = contact_at((0.5, -0.25, -0.5), (-0.25, 0.5, 0.5), (0.5, -0.5, 0.25))
+    np.testing.assert_array_equal(collision_point(mixed, np.zeros(3)), [-0.25, 0.5, 0.5])
 
 
 def test_a_witness_alone_is_the_collision_point() -> None:

@@ -216,7 +216,13 @@ def test_the_cameras_that_end_a_stretch() -> None:
 def test_a_camera_that_may_abstain_ends_a_stretch_when_it_is_needed(
     min_cameras: int, expected: tuple[int, ...]
 ) -> None:
-    hull = small_hull([[[1, 1, 1, 1]], [[1, 1, 1]]], "keep", min_cameras)
+    behind = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, -20.0]])  # sees nothing of it
+    hull = small_hull(
+        [[[1, 1, 1, 1]], [[1, 1, 1]], [[1]]],
+        "keep",
+        min_cameras,
+        (ALONG_Z, ALONG_MINUS_Z, behind),
+    )
 
     assert boundary_cameras(hull, np.array([15.0, 2.0, 5.0]), X) == expected
 
