@@ -55,7 +55,7 @@ def synth(
       curtain  a hand through a curtain in a window
 
     \b
-    Examples:
+    Example:
       hybridve synth boxes -o my_session
       hybridve synth payload -o with_tongs --participant 2 --gap-mm 150
     """
