@@ -4,7 +4,13 @@ from functools import cache
 
 import numpy as np
 from helpers.cones import BOX_FACES, box_vertices, views_from
-from helpers.hulls import ball_masks
+from helpers.hulls import (
+    EMPTYING_MASK_KINDS,
+    MASK_KINDS,
+    ball_masks,
+    random_masks,
+    random_views,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,8 +18,8 @@ from hybridve.hull.contact.bulge import Ray, farthest_on, real_upper
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
 from hybridve.hull.contact.detect import Contact
-from hybridve.hull.contact.uncertainty import Doubter, outline_errors
-from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
+from hybridve.hull.query.silhouettes import Hull, Unseen, make_hull
 
 BOX_HALF_M = 0.1
 
@@ -94,3 +100,31 @@ def test_a_doubt_does_not_depend_on_what_was_doubted_before(
 
     for name in first.__slots__:
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name), err_msg=name)
+
+
+@settings(max_examples=40)
+@given(seed=seeds, n_cameras=st.integers(1, 5), unseen=st.sampled_from(["carve", "keep"]))
+def test_whatever_the_silhouettes_a_doubt_agrees_with_itself(
+    seed: int, n_cameras: int, unseen: Unseen
+) -> None:
+    rng = np.random.default_rng(seed)
+    views = random_views(rng, n_cameras, unseen, int(rng.integers(1, n_cameras + 1)), 100)
+    kinds = rng.choice(MASK_KINDS * 3 + EMPTYING_MASK_KINDS, n_cameras).tolist()
+    hull = make_hull(views, random_masks(rng, views, kinds))
+    clearance = meter().measure(hull)
+    contact = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+    doubter = Doubter(outline_errors(views.names, {}, [0.0] * n_cameras), DoubtSettings(cell_m=0.2))
+
+    found = doubter.frame(hull).doubt(meter(), contact, clearance)
+
+    assert (found.mm_per_px >= 0).all() or np.isnan(found.mm_per_px).all()
+    assert not found.at_least_m > clearance.lower_m
+    assert found.real_upper_m >= clearance.lower_m
+    assert found.survives == (not found.hinges_on)
+    assert set(found.hinges_on) <= set(views.names)
+    if np.isinf(clearance.upper_m):
+        assert (found.n_seeing, found.component) == (0, "")
+    else:
+        assert found.n_seeing >= (n_cameras if unseen == "carve" else views.min_cameras)
+        reach_m = np.linalg.norm(clearance.on_hull_world)
+        assert found.component != "" or reach_m > 3.0
