@@ -55,6 +55,9 @@ _FINE = 1.0 / 8.0
 #: Points that look for a deeper one, and how often they move closer together around the deepest.
 _LOOK_POINTS, _LOOKS = 17, 2
 
+#: Cells that are sooner cut than spared by a deeper point.
+_FEW_CELLS = 100
+
 #: Halvings of the root at most; cubes are never as small before they are small enough.
 _MOST_LEVELS = 64
 
@@ -206,7 +209,8 @@ class ClearanceMeter:
                 best,
             )
             if deepest >= 0:
-                self._look_deeper(best, center[deepest], half_m, asked)
+                n_looks = _LOOKS if len(center) > _FEW_CELLS else 0
+                self._look_deeper(best, center[deepest], half_m, asked, n_looks)
             kept = lower_m < best.distance_m[0] - self.tolerance_m
             dropped_m = min(dropped_m, lower_m[~kept].min(initial=np.inf))
             lowest_m = lower_m[kept].min(initial=np.inf)
@@ -219,7 +223,8 @@ class ClearanceMeter:
                 or best.distance_m[0] < stop_below_m
             ):
                 break
-        upper_m, on_object = np.inf, best.point
+        upper_m: float = np.inf
+        on_object = best.point
         if best.distance_m[0] < np.inf:  # the exact distance of the best point
             signed_m, nearest = self._surface.signed(best.point[None])
             upper_m, on_object = float(signed_m[0]), nearest[0]
@@ -235,7 +240,12 @@ class ClearanceMeter:
         )
 
     def _look_deeper(
-        self, best: Best, point: NDArray[np.float64], half_m: float, asked: CellFrame
+        self,
+        best: Best,
+        point: NDArray[np.float64],
+        half_m: float,
+        asked: CellFrame,
+        n_looks: int,
     ) -> None:
         """Follow the way from the surface through a point (3,) of the hull, into the solid.
 
@@ -243,13 +253,15 @@ class ClearanceMeter:
         found is taken if it betters the best point; its distance is exact.
         """
         signed_m, nearest = self._surface.signed(point[None])
+        if signed_m[0] < best.distance_m[0]:
+            best.distance_m[0], best.point[:] = signed_m[0], point
         away = point - nearest[0]
         length_m = float(np.linalg.norm(away))
         if length_m == 0:
             return
         away *= np.copysign(1.0, -signed_m[0]) / length_m
         begin_m, reach_m = 0.0, 2.0 * half_m
-        for _ in range(_LOOKS):
+        for _ in range(n_looks):
             along_m = begin_m + reach_m * np.linspace(0.0, 1.0, _LOOK_POINTS)
             points = point + along_m[:, None] * away
             inside = are_inside(points, asked)
