@@ -228,15 +228,15 @@ class ClearanceMeter:
         if best.distance_m[0] < np.inf:  # the exact distance of the best point
             signed_m, nearest = self._surface.signed(best.point[None])
             upper_m, on_object = float(signed_m[0]), nearest[0]
-        lower_m = float(min(lowest_m, dropped_m, upper_m, self._reach_m))
-        lower_m -= _ROUNDOFF * self._half_m
+        least_m = float(min(lowest_m, dropped_m, upper_m, self._reach_m))
+        least_m -= _ROUNDOFF * self._half_m
         return Clearance(
-            lower_m=max(lower_m, 0.0),
+            lower_m=max(least_m, 0.0),
             upper_m=max(upper_m, 0.0),
             on_object_world=on_object + origin_world,
             on_hull_world=best.point + origin_world,
             depth_lower_m=max(-upper_m, 0.0) if self.is_closed else np.nan,
-            depth_upper_m=max(-lower_m, 0.0) if self.is_closed else np.nan,
+            depth_upper_m=max(-least_m, 0.0) if self.is_closed else np.nan,
         )
 
     def _look_deeper(
@@ -280,4 +280,4 @@ def _joined(first: Cubes, second: Cubes) -> Cubes:
     """Return the cubes of both, in order."""
     if len(second.half_m) == 0:
         return first
-    return Cubes(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
+    return Cubes(*(np.concatenate([a, b]) for a, b in zip(first, second, strict=True)))
