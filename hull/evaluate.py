@@ -27,8 +27,7 @@ from hybridve.hull.capture.recording import (
     check_lengths,
     check_recording,
     claimed_length,
-    segmented_frames,
-    stored_frames,
+    silhouettes_of,
     stored_silhouettes,
 )
 from hybridve.hull.capture.rig import load_rig, rig_digest
@@ -481,10 +480,10 @@ def _silhouettes(
     if frames.stop is not None and start >= frames.stop:
         return
     rest = FrameRange(start, frames.stop, frames.step)
-    if chain.silhouettes is not None:
-        with SilhouetteReader(chain.silhouettes) as reader:
-            yield from stored_frames(chain.session, reader, rest, undistortions=chain.undistortions)
-        return
-    yield from segmented_frames(
-        chain.session, rest, undistortions=chain.undistortions, progress=progress
+    yield from silhouettes_of(
+        chain.session,
+        chain.silhouettes,
+        rest,
+        undistortions=chain.undistortions,
+        progress=progress,
     )
