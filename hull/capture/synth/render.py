@@ -367,27 +367,27 @@ def add_shapes(
     picture[rows, columns] = color
 
     rows, columns = np.nonzero(at_edge)
-    total = np.zeros((len(rows), 3))
-    covered = np.zeros(len(rows))
+    # Many places within each of these pixels, one place after another.
+    offsets = np.array(_offsets(4))
+    count = len(rows)
+    rays = view.rays_cam[rows, columns] + offsets[:, :1, None] * view.across[rows, columns]
+    rays += offsets[:, 1:, None] * view.down[rows, columns]  # (16, N, 2)
     # Which shapes an edge pixel can see are those in whose window it lies.
-    present = np.unique(seen[seen > 0])
     among = {}
-    for number in present:
+    for number in np.unique(seen[seen > 0]):
         window = _shape_window(view, shapes[number - 1].shape, world_from_shape[number - 1])
         if window is not None:
             inside = (rows >= window[0].start) & (rows < window[0].stop)
             inside &= (columns >= window[1].start) & (columns < window[1].stop)
-            among[int(number)] = np.flatnonzero(inside)
-    offsets = _offsets(4)
-    for x, y in offsets:
-        rays = (
-            view.rays_cam[rows, columns]
-            + x * view.across[rows, columns]
-            + y * view.down[rows, columns]
-        )
-        color, hit = _shape_colors(view, rays, lamp, shapes, world_from_shape, among)
-        total += color * hit[:, None]
-        covered += hit
+            places = count * np.arange(len(offsets))[:, None] + np.flatnonzero(inside)
+            among[int(number)] = places.ravel()
+    color, hit = _shape_colors(view, rays.reshape(-1, 2), lamp, shapes, world_from_shape, among)
+    total = np.zeros((count, 3))
+    covered = np.zeros(count)
+    for part in range(len(offsets)):
+        mine = slice(part * count, (part + 1) * count)
+        total += color[mine] * hit[mine, None]
+        covered += hit[mine]
     covered /= len(offsets)
     total /= len(offsets)
     picture[rows, columns] = (1.0 - covered)[:, None] * picture[rows, columns] + total
