@@ -1,5 +1,7 @@
 """Connected volumes of a hull, and phantom volumes where they must be."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers.cones import hull_of_balls, views_from
@@ -8,6 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hybridve.hull.capture.recording import FrameRange, segmented_frames
+from hybridve.hull.capture.rig import load_rig
+from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.components import (
     NOWHERE,
     Volumes,
@@ -17,6 +22,7 @@ from hybridve.hull.contact.components import (
     is_real,
     pixel_ray,
 )
+from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.query.walk import spans_in_hull
@@ -193,3 +199,22 @@ def test_what_is_called_real_holds_a_part_of_a_real_ball(
 def test_cells_have_a_size() -> None:
     with pytest.raises(ValueError, match="cell_m is 0"):
         connected_volumes(ball_hull(ring_views(), np.zeros(3), 0.1), 0.0)
+
+
+@pytest.mark.recording
+def test_a_hand_whose_arm_one_silhouette_lacks_is_a_volume_of_its_own_and_real(
+    recordings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In frame 190 the last camera's silhouette shows the hand, but no arm.
+    monkeypatch.setenv("HYBRIDVE_DATA", str(recordings.resolve()))
+    session = load_session(Path(__file__).parent.parent / "data" / "child_rope" / "session.toml")
+    views, lenses = rig_views(session, load_rig(session))
+    (seen,) = segmented_frames(session, FrameRange(190, 191), undistortions=lenses)
+    assert seen.masks is not None
+
+    volumes, real = tell(make_hull(views, seen.masks))
+
+    child, hand = np.array([0.36, 0.02, 0.58]), np.array([0.02, -0.07, 0.78])
+    assert len(volumes) == 2
+    assert {volume_at(volumes, child), volume_at(volumes, hand)} == {0, 1}
+    assert real == [True, True]

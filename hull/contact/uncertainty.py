@@ -216,7 +216,8 @@ class Doubt:
     survives : bool
         Exact: whether the verdict, touched or not, stands with any one camera left out.
     hinges_on : tuple of str
-        Exact: the cameras without which it does not.
+        Exact: the cameras without which it does not. A contact stands if one of its known points
+        does, a free object if it is certainly free: not within the meter's tolerance of the hull.
     component : "real", "unsure" or ""
         Bound, given right silhouettes: "real" if the volume that touches or is nearest is proved to
         hold something real; "unsure" if each pixel it explains is explained by another volume, too,
