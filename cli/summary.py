@@ -74,6 +74,9 @@ def print_summary(report: "Report") -> None:
         click.echo(f"  {invalid} could not be evaluated:")
         for reason, count in numbers["reasons"].items():
             click.echo(f"    {count} x {reason}")
+    if numbers["frames_without_hull"]:
+        empty = options.counted(numbers["frames_without_hull"], "frame")
+        click.echo(f"  {empty} without a hull: a camera saw nothing, and nothing can be touched")
     rows = [("object", "verdict", "frames", "certain", "when", "points, most", "triangles, most")]
     for found in numbers["objects"]:
         rows.append(

@@ -6,6 +6,7 @@ import numpy as np
 
 from hybridve.calib.errors import ReportError
 from hybridve.hull.report.read import ObjectColumns, Report
+from hybridve.hull.report.summarize import count_without_hull
 from hybridve.hull.view.chart import ClearanceCurve, write_clearances
 
 #: Panels in one picture, the nearest objects; more could not be read.
@@ -29,15 +30,19 @@ def write_curves(path: Path, report: Report) -> None:
         )
     nearest = sorted(curves, key=_nearest_mm)[:_MOST_PANELS]
     shown = [curve for curve in curves if curve in nearest]  # in the scene's order
-    note = ""
+    notes = []
     if len(shown) < len(curves):
-        note = f"the nearest {len(shown)} of {len(curves)} objects"
+        notes.append(f"the nearest {len(shown)} of {len(curves)} objects")
+    if n_empty := count_without_hull(report):
+        notes.append(f"{n_empty} of {len(report.index)} frames have no hull and no curve")
     title = f"{report.path.name}: clearance between the hull and each object"
-    write_clearances(path, shown, title=title, note=note)
+    write_clearances(path, shown, title=title, note="; ".join(notes))
 
 
 def _curve(name: str, rows: ObjectColumns, report: Report) -> ClearanceCurve:
     lower_m, upper_m = rows["clearance_m"].T
+    # Where there is no hull, the lower bound is how far was looked: metres, beyond all that counts.
+    lower_m, upper_m = (np.where(np.isfinite(upper_m), edge, np.nan) for edge in (lower_m, upper_m))
     shallow_m, deep_m = np.nan_to_num(rows["depth_m"]).T
     at_least_m = rows.get("clearance_at_least_m")
     first_s = rows.get("first_contact_s")

@@ -340,14 +340,11 @@ def _compared(
     """Return a finding with what the frame before adds to it."""
     seconds = seen.time_s - before.time_s
     if finding.clearance is not None:
-        finding = replace(
-            finding,
-            approach_m_s=approach_speed(
-                signed_clearance(before.clearances[number]),
-                signed_clearance(finding.clearance),
-                seconds,
-            ),
-        )
+        was, became = before.clearances[number], finding.clearance
+        # A hull that comes from nowhere, as after a camera that saw nothing, has not approached.
+        if np.isfinite(was.upper_m) and np.isfinite(became.upper_m):
+            speed_m_s = approach_speed(signed_clearance(was), signed_clearance(became), seconds)
+            finding = replace(finding, approach_m_s=speed_m_s)
     earlier = Finding(
         before.contacts[number], before.clearances[number] if before.clearances else None
     )

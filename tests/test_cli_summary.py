@@ -269,6 +269,24 @@ def test_a_report_without_clearances_has_no_curves_and_says_how_to_get_them(
     assert not (tmp_path / "curves.png").exists()
 
 
+def test_frames_without_a_hull_are_told_and_leave_a_gap_in_the_curve(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "r.h5"
+    nowhere = Clearance(15.8, np.inf, np.full(3, np.nan), np.full(3, np.nan), 0.0, 0.0)
+    numbers = only([near(20.0, 15.0), replace(near(20.0), clearance=nowhere)], path)
+    drawn: list[Any] = []
+    monkeypatch.setattr("hybridve.hull.curves.write_clearances", lambda *a, **k: drawn.append(a))
+
+    assert run("summary", path, "--picture", tmp_path / "curves.png") == 0
+
+    assert numbers["frames_without_hull"] == 1
+    assert "1 frame without a hull" in capsys.readouterr().out
+    (curve,) = drawn[0][1]
+    assert np.isfinite(curve.lower_mm).tolist() == [True, False]
+    assert np.isfinite(curve.upper_mm).tolist() == [True, False]
+
+
 def test_of_many_objects_the_nearest_are_drawn(
     tmp_path: Path, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from helpers.sessions import BALL_RADIUS_M, write_ball_session, write_cube_scene
@@ -192,6 +193,26 @@ def test_the_speed_of_approach_is_what_the_signed_clearance_changed_by(
     lower, upper = found[1].approach_m_s
     assert lower - 1.0 < 0.15 * FPS < upper + 1.0
     assert 0 <= upper - lower < 2.1e-4 * FPS
+
+
+def test_a_hull_that_comes_from_nowhere_has_no_speed(
+    tmp_path: Path, scene: Path, engine: Engine
+) -> None:
+    session = write_ball_session(tmp_path, CENTERS[:4])
+    cv2.imwrite(str(tmp_path / "cam1" / "1.png"), np.zeros((120, 160), np.uint8))
+
+    found = hits(list(evaluate(chain_of(session, scene, doubt=None), engine)))
+
+    assert found[1] is not None
+    assert found[1].clearance is not None
+    assert np.isposinf(found[1].clearance.upper_m)
+    known = [f is not None and bool(np.isfinite(f.approach_m_s).all()) for f in found]
+    assert known == [False, False, False, True]
+    # It was free, and then it was touched: contact began, but nothing tells when.
+    assert found[2] is not None
+    assert found[2].first_contact is not None
+    assert found[2].first_contact.status == "outline lost"
+    assert found[2].first_contact_uncertainty_s == 0.5 / FPS
 
 
 def test_something_wholly_inside_a_closed_object_is_told_and_in_an_open_one_is_not(

@@ -206,7 +206,7 @@ def test_clearances_are_drawn_as_a_band_with_all_that_belongs_to_it() -> None:
 def test_what_an_object_has_not_is_not_drawn() -> None:
     plain = clearance_curve(
         lower_mm=np.full(N_FRAMES, 30.0),
-        upper_mm=np.full(N_FRAMES, np.inf),
+        upper_mm=np.full(N_FRAMES, np.nan),
         at_least_mm=np.full(N_FRAMES, np.nan),
         clashes=np.zeros(N_FRAMES, np.bool_),
         required_mm=0.0,

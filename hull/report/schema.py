@@ -319,8 +319,8 @@ _APPROACH: "tuple[Column[Finding], ...]" = (
         "bound",
         "lower and upper bound of the mean speed at which hull and object came nearer since the "
         "frame before, depth counting as negative distance; negative where they parted; infinite "
-        "where nothing bounds it, as in an object that is not closed; NaN in the first frame and "
-        "after one that was not evaluated",
+        "where nothing bounds it, as in an object that is not closed; NaN in the first frame, "
+        "beside one that was not evaluated and one without a hull",
         np.float64,
         lambda finding: finding.approach_m_s,
         shape=(2,),

@@ -16,12 +16,13 @@ def summarize(report: Report) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``report``, ``frames``, ``frames_invalid``, ``reasons`` (text to count), ``seconds`` (from
-        first to last frame), ``engine``, ``renderer``, ``stage_ms_mean``, ``viewports`` (smallest
-        and largest), ``samples``, ``sample_spacing_m`` (largest) and ``objects``: for
-        each ``name``, ``verdict`` ("colliding"; "inside": never touched, but something was wholly
-        inside the closed object; "free": proved in every evaluated frame, "open": so
-        but for contacts thinner than ``open_at_m``, "clear": no sample collided, nothing more was
+        ``report``, ``frames``, ``frames_invalid``, ``reasons`` (text to count),
+        ``frames_without_hull`` (see `count_without_hull`), ``seconds`` (from first to last frame),
+        ``engine``, ``renderer``, ``stage_ms_mean``, ``viewports`` (smallest and largest),
+        ``samples``, ``sample_spacing_m`` (largest) and ``objects``: for each ``name``, ``verdict``
+        ("colliding"; "inside": never touched, but something was wholly inside the closed object;
+        "free": proved in every evaluated frame; "open": so but for contacts thinner than
+        ``open_at_m``; "clear": no sample collided, nothing more was
         asked), frames by what is known of them (``frames_colliding``: sampled or certified; frames
         without a sample but with a witness are those that sampling alone would have missed;
         ``frames_inside`` besides), the most points and triangles in one frame and ``spans`` of
@@ -43,6 +44,7 @@ def summarize(report: Report) -> dict[str, Any]:
         "frames": len(report.index),
         "frames_invalid": int((~is_valid).sum()),
         "reasons": dict(Counter(report.reason[~is_valid].tolist())),
+        "frames_without_hull": count_without_hull(report),
         "seconds": float(report.time_s[-1] - report.time_s[0]) if len(report.time_s) else 0.0,
         "engine": report.attributes.get("engine", ""),
         "renderer": report.attributes.get("renderer", ""),
@@ -69,6 +71,17 @@ def summarize(report: Report) -> dict[str, Any]:
             for name, rows in report.objects.items()
         ],
     }
+
+
+def count_without_hull(report: Report) -> int | None:
+    """Return how many evaluated frames have no hull near any object; None if nobody looked.
+
+    As a rule a camera's silhouette is empty there: everything is free, which says little.
+    """
+    uppers_m = [
+        rows["clearance_m"][:, 1] for rows in report.objects.values() if "clearance_m" in rows
+    ]
+    return int(np.isinf(uppers_m).all(axis=0).sum()) if uppers_m else None
 
 
 def failing(summary: dict[str, Any]) -> list[str]:

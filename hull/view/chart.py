@@ -81,7 +81,7 @@ class ClearanceCurve:
         Ascending.
     lower_mm, upper_mm : (F,) float64
         Bounds of the clearance, depth beneath the surface of a closed object counting as negative;
-        NaN where a frame was not evaluated, inf above where no hull was found.
+        NaN where a frame was not evaluated or has no hull.
     at_least_mm : (F,) float64
         What the clearance is at least, at 95 %; NaN where unknown.
     clashes : (F,) bool
@@ -364,8 +364,7 @@ def draw_clearances(curves: Sequence[ClearanceCurve], *, title: str, note: str =
 
 def _draw_clearance(axes: Axes, curve: ClearanceCurve) -> None:
     time_s = curve.time_s
-    upper_mm = np.where(np.isfinite(curve.upper_mm), curve.upper_mm, np.nan)
-    lower_mm = np.where(np.isfinite(curve.lower_mm), curve.lower_mm, np.nan)
+    lower_mm, upper_mm = curve.lower_mm, curve.upper_mm
     # A band a tenth of a millimetre wide would not be seen: its edges are drawn as lines.
     axes.fill_between(
         time_s, lower_mm, upper_mm, color=_BOUNDS, alpha=0.35, linewidth=0, label="bounds"
