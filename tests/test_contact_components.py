@@ -15,6 +15,7 @@ from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.components import (
     NOWHERE,
+    Coverage,
     Volumes,
     connected_volumes,
     cover,
@@ -69,6 +70,20 @@ def test_rays_of_different_balls_cross_in_a_phantom_that_is_unsure_and_the_balls
     of_a, of_b, of_phantom = (volume_at(volumes, point) for point in (BALL_A, BALL_B, phantom))
     assert len({of_a, of_b, of_phantom}) == 3 == len(volumes)
     assert [real[of_a], real[of_b], real[of_phantom]] == [True, True, False]
+
+
+def test_the_proof_rests_on_rays_and_not_on_the_blocks_that_suggest_them() -> None:
+    phantom = crossing(FIRST, BALL_B, SECOND, BALL_A)
+    third = phantom + (BALL_A - phantom) * 3.0 / np.linalg.norm(BALL_A - phantom)
+    hull = hull_of_balls(
+        views_from([FIRST, SECOND, third]), [(BALL_A, RADIUS_M), (BALL_B, RADIUS_M)]
+    )
+    volumes, _ = tell(hull)
+    number = volume_at(volumes, phantom)
+
+    everywhere = Coverage([np.full((120, 160), number)] * 3)
+
+    assert not is_real(hull, volumes, everywhere, number)
 
 
 def test_a_camera_that_sees_background_through_a_phantom_carves_it() -> None:
