@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from hybridve.hull.capture.session import load_session
 from hybridve.hull.capture.synth import PRESETS, read_truth
 from hybridve.hull.contact.scene import load_scene
 
@@ -12,17 +13,30 @@ Run = Callable[..., int]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def synth(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Generate a recording with few pictures of the board; returns its folder."""
     from click.testing import CliRunner
 
     from hybridve.cli.main import cli
+    from hybridve.hull.capture.synth import write
 
-    folder = tmp_path_factory.mktemp("synth") / "payload"
-    asked = ["payload", "-o", folder, "--participant", 2, "--gap-mm", 180, "--n-frames", 4]
-    result = CliRunner().invoke(cli, ["synth", *map(str, asked)], catch_exceptions=False)
-    assert result.exit_code == 0
-    assert result.stdout.strip() == str(folder / "session.toml")
-    return folder
+    def generate(preset: str, *options: object) -> Path:
+        folder = tmp_path_factory.mktemp("synth") / preset
+        with pytest.MonkeyPatch.context() as patch:
+            for name in ("N_STILLS", "N_BOARD_FRAMES", "N_BACKGROUND_FRAMES"):
+                patch.setattr(write, name, 1)
+            asked = ["synth", preset, "-o", folder, *options]
+            result = CliRunner().invoke(cli, list(map(str, asked)), catch_exceptions=False)
+        assert result.exit_code == 0
+        assert result.stdout.strip() == str(folder / "session.toml")
+        return folder
+
+    return generate
+
+
+@pytest.fixture(scope="module")
+def folder(synth: Callable[..., Path]) -> Path:
+    return synth("payload", "--participant", 2, "--gap-mm", 180, "--n-frames", 4)
 
 
 def test_the_help_names_every_preset(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,6 +81,27 @@ def test_the_spacing_reads_back_as_it_was_asked(folder: Path) -> None:
         assert by_frame_m[frame] == by_frame_m.max() == needed_m
         assert (by_frame_m >= found.range_m[0]).all()
     assert found.needed_hull_m >= found.needed_m
+
+
+def test_the_ball_and_the_curtain_are_sessions_with_a_scene(synth: Callable[..., Path]) -> None:
+    for preset, names in (("ball", ["ball"]), ("curtain", ["curtain", "window"])):
+        folder = synth(preset, "--n-frames", 3)
+
+        session, truth = load_session(folder), read_truth(folder)
+        scene = load_scene(folder / "scene.toml")
+        assert [thing.name for thing in scene.objects] == list(truth.objects) == names
+        for camera in session.cameras:
+            assert camera.recording is not None
+            assert camera.recording.count() == 3
+        # In the middle the hand is in the curtain; the ball is touched before that and after.
+        assert truth.objects[names[0]].collides.tolist() == [False, preset == "curtain", False]
+        if preset == "curtain":
+            (curtain, window) = scene.objects
+            assert len(curtain.faces) == 720
+            assert curtain.recovery_direction is not None
+            assert curtain.recovery_direction.tolist() == [0.0, 1.0, 0.0]
+            assert window.recovery_direction is None
+            assert truth.spacing == {}
 
 
 @pytest.mark.parametrize(
