@@ -10,6 +10,8 @@ import pytest
 from helpers.sessions import write_ball_session, write_cube_scene
 
 from hybridve.hull.report.read import read_report
+from hybridve.hull.report.schema import FrameResult
+from hybridve.hull.report.write import ReportWriter
 
 Run = Callable[..., int]
 
@@ -136,6 +138,39 @@ def test_resuming_makes_what_is_missing_and_keeps_what_is_finished(
 
     assert (folder / "bob__near.h5").exists()
     assert all((folder / name).read_bytes() == content for name, content in kept.items())
+
+
+def test_an_interrupted_call_goes_on_in_the_middle_of_a_report(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    sessions: list[Path],
+    layouts: list[Path],
+) -> None:
+    whole, folder = tmp_path / "whole", tmp_path / "out"
+    assert run(*arguments(sessions, layouts[:1], whole)) == 0
+    appended: list[FrameResult] = []
+    append = ReportWriter.append
+
+    def append_three(writer: ReportWriter, result: FrameResult) -> None:
+        if len(appended) == 3:  # two of the first report, one of the second
+            raise KeyboardInterrupt
+        appended.append(result)
+        append(writer, result)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ReportWriter, "append", append_three)
+        assert run(*arguments(sessions, layouts[:1], folder)) == 130
+    assert {path.name for path in folder.iterdir()} == {"ann__near.h5", "bob__near.h5.parts"}
+
+    assert run(*arguments(sessions, layouts[:1], folder, "--resume")) == 0
+
+    names = {path.name for path in whole.iterdir()}
+    assert {path.name for path in folder.iterdir()} == names
+    expected, found = (read_report(place / "bob__near.h5").objects for place in (whole, folder))
+    assert found["cube"]["first_contact_s"][1] > 0, "what hangs on the frame before the cut"
+    for name, values in expected["cube"].columns.items():
+        assert found["cube"][name].tobytes() == values.tobytes(), name
 
 
 def test_a_finished_report_of_other_settings_is_not_taken_for_this_one(
