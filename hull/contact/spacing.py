@@ -12,7 +12,7 @@ The second is little where a thin part is deep in a thick hull. So the line alon
 the witness is looked at: with T the stretches of it in the hull, and O those in the object or
 nearer to it than C, every shift in m + T - O violates, be it half a metre of them.
 
-What is left is halved. A piece no wider than the tolerance is measured once more, and what that
+What is left is halved. A piece a quarter of the tolerance wide is measured once more, and what that
 does not decide stays *undecided*: whoever asks counts it as violated, which is safe.
 """
 
@@ -29,6 +29,9 @@ from hybridve.hull.query.walk import spans_in_hull
 
 #: Proofs are told less wide by this, far above rounding and far below what matters, metres.
 _MARGIN_M = 1e-9
+
+#: Pieces this share of the tolerance wide are not cut any further.
+_FINEST = 1.0 / 4.0
 
 #: A witness this many tolerances too near ends a measurement.
 _DEEP_ENOUGH = 4.0
@@ -51,7 +54,7 @@ class Move:
     start_m, stop_m : float
         The range of shifts along it, start < stop.
     tolerance_m : float
-        Pieces of the range that are no wider are not cut any further, above 0.
+        How narrowly it is to be known where the clearance is kept, above 0.
     """
 
     direction: NDArray[np.float64]
@@ -92,7 +95,7 @@ class BlockedShifts:
         Stretches of shifts that certainly violate, ascending and apart, metres.
     undecided_m : (M, 2) float64
         Stretches between them of which nothing is known. Where the clearance is just kept, or just
-        not, several pieces as wide as the tolerance may follow each other.
+        not, many pieces may follow each other.
     n_measured : int
         How many measurements that took.
     """
@@ -211,7 +214,7 @@ def _blocked_by(
         keeps, violates = _decided_at(hull, one, move, middle_m, half_m)
         n_measured += 1
         free_m, violated_m = union(free_m, keeps), union(violated_m, violates)
-        if high_m - low_m > move.tolerance_m:
+        if high_m - low_m > _FINEST * move.tolerance_m:
             pieces += [(middle_m, high_m), (low_m, middle_m)]
         else:
             undecided.append(without(piece, union(free_m, violated_m)))
