@@ -194,6 +194,25 @@ def test_status_3_tells_of_a_clash_only_if_asked(
     assert run(*clear, "-o", tmp_path / "c.h5", "--fail-on-clash") == 0
 
 
+def test_something_inside_or_too_near_is_a_clash_too(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = write_cube_scene(tmp_path / "room", {"room": (0.0, 0.0, 0.0)})
+    mesh = tmp_path / "room" / "cube.obj"
+    mesh.write_text(mesh.read_text(encoding="utf-8").replace("100", "1300"), encoding="utf-8")
+    near = write_cube_scene(tmp_path / "near", {"near": (0.0, 0.0, 0.0)})
+    text = near.read_text(encoding="utf-8")
+    # In frame 0 the ball, of 0.2 m about (-0.9, 0, 0), is 0.6 m away from the cube.
+    common = ("--frames", "0", "--no-doubt", "--viewport", 3, "--fail-on-clash")
+
+    assert run("detect", session, "--scene", room, "-o", tmp_path / "a.h5", *common) == 3
+    assert "inside" in capsys.readouterr().out
+    for required_mm, status in ((700, 3), (400, 0)):
+        near.write_text(f"{text}required_clearance_mm = {required_mm}\n", encoding="utf-8")
+        path = tmp_path / f"{required_mm}.h5"
+        assert run("detect", session, "--scene", near, "-o", path, *common) == status, required_mm
+
+
 def test_an_existing_report_is_refused_and_kept(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
