@@ -268,9 +268,9 @@ class _Tools:
             # Late: it brings scipy's optimisers, for which a picture or a sweep need not wait.
             from hybridve.hull.contact.uncertainty import Doubter, outline_errors
 
-            shift_px = [_mask_shift_px(chain)[name] for name in chain.views.names]
+            names, shift_px = chain.views.names, _mask_shift_px(chain)
             errors = outline_errors(
-                chain.views.names, chain.rig.provenance, shift_px, settings.doubt
+                names, chain.rig.provenance, [shift_px[name] for name in names], settings.doubt
             )
             doubter = Doubter(errors, settings.doubt)
         with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:
