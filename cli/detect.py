@@ -81,8 +81,9 @@ def detect(
     clearance between two bounds, which way the object must give, when contact began, and how far
     all this can be trusted.
 
-    With several SESSIONs, or several --scene, every session is tested against every layout: OUT is
+    With several SESSIONs, or several --scene, every session is tested against every layout: -o is
     a folder that takes a report each, SESSION__SCENE.h5, and a table of them all, COMPARISON.csv.
+    Run `hybridve segment` first where there are many layouts: each takes the silhouettes as stored.
 
     \b
     Example:
