@@ -331,16 +331,7 @@ def write_picture_of(path: Path, spacing: Spacing) -> None:
         If it cannot be written.
     """
     settings = spacing.settings
-    curves = [
-        ShiftCurve(
-            name=f"{one.name} ({one.frames.n_valid} frames)",
-            shift_mm=1e3 * one.curve.shift_m,
-            violated=one.curve.violated.astype(np.float64),
-            at_most=(one.curve.violated + one.curve.undecided).astype(np.float64),
-            answer_mm=1e3 * one.shift_m,
-        )
-        for one in spacing.sessions
-    ]
+    curves = [curve_of(one) for one in spacing.sessions]
     direction = ", ".join(f"{value:.3g}" for value in settings["direction"])
     required = ", ".join(f"{1e3 * one:g}" for one in dict.fromkeys(settings["required_m"]))
     title = (
@@ -348,3 +339,23 @@ def write_picture_of(path: Path, spacing: Spacing) -> None:
         "violate it"
     )
     write_spacing_chart(path, curves, title=title)
+
+
+def curve_of(one: SessionSpacing) -> ShiftCurve:
+    """Return the curve of one session with every step where it is, not where it was counted."""
+    frames, counted_m = one.frames, one.curve.shift_m
+    ends_m = [frames.violated.shift_m.ravel(), frames.undecided.shift_m.ravel()]
+    shift_m = np.unique(np.concatenate([counted_m[[0, -1]], *ends_m]))
+    middle_m = 0.5 * (shift_m[1:] + shift_m[:-1])
+    violated, at_most = np.zeros(len(middle_m)), np.zeros(len(middle_m))
+    for row in range(len(frames.index)):
+        certain = covers(frames.violated.of(row), middle_m)
+        violated += certain
+        at_most += certain | covers(frames.undecided.of(row), middle_m)
+    return ShiftCurve(
+        name=f"{one.name} ({frames.n_valid} frames)",
+        shift_mm=1e3 * shift_m,
+        violated=violated,
+        at_most=at_most,
+        answer_mm=1e3 * one.shift_m,
+    )

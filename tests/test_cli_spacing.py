@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from helpers.sessions import write_ball_session, write_cube_scene
+from matplotlib.patches import StepPatch
 
 from hybridve.hull.report.spacing_file import read_spacing, spacing_as_dict
+from hybridve.hull.spacing import curve_of
 from hybridve.hull.view.spacing_chart import ShiftCurve, draw_spacing_chart
 
 Run = Callable[..., int]
@@ -160,21 +162,39 @@ def test_wrong_usage_is_status_2_and_says_what(
 
 
 def test_the_chart_shows_counts_and_answers_where_they_belong() -> None:
-    shift_mm = np.array([0.0, 10.0, 20.0])
+    shift_mm = np.array([0.0, 10.0, 20.0, 30.0])
     curves = [
-        ShiftCurve("p1", shift_mm, np.array([3.0, 1.0, 0.0]), np.array([3.0, 2.0, 0.0]), 12.5),
+        ShiftCurve("p1", shift_mm, np.array([3.0, 1.0, 0.0]), np.array([3.0, 2.0, 0.0]), 20.0),
         ShiftCurve("p2", shift_mm, np.array([3.0, 3.0, 2.0]), np.array([3.0, 3.0, 2.0]), np.nan),
     ]
 
     axes = draw_spacing_chart(curves, title="part").axes[0]
 
-    lines = [
-        (np.asarray(line.get_xdata()).tolist(), np.asarray(line.get_ydata()).tolist())
-        for line in axes.lines
-    ]
+    steps = [patch.get_data() for patch in axes.patches if isinstance(patch, StepPatch)]
+    drawn = [(step.values.tolist(), step.edges.tolist()) for step in steps]
     for curve in curves:
-        assert (shift_mm.tolist(), curve.violated.tolist()) in lines
-    assert ([12.5, 12.5], [0, 1]) in lines
+        for values in (curve.violated, curve.at_most):
+            assert (values.tolist(), shift_mm.tolist()) in drawn
+    lines = [np.asarray(line.get_xdata()).tolist() for line in axes.lines]
+    assert lines == [[20.0, 20.0], [20.0]]
     legend = axes.get_legend()
     assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["p1: 12.5 mm", "p2: none is free"]
+    assert [text.get_text() for text in legend.get_texts()] == ["p1: 20.0 mm", "p2: none is free"]
+
+
+def test_the_picture_of_a_recording_has_its_steps_where_they_are(
+    run: Run, task: list[object], tmp_path: Path
+) -> None:
+    output = tmp_path / "out.h5"
+    assert run(*task, "-o", output, "--step-mm", 200) == 0
+    written = read_spacing(output)
+    one = written.sessions[0]
+
+    curve = curve_of(one)
+
+    assert curve.shift_mm[[0, -1]].tolist() == [-50.0, 400.0]
+    at_answer = np.searchsorted(curve.shift_mm, 1e3 * one.shift_m + 1e-6) - 1
+    assert curve.at_most[at_answer] == 0
+    assert curve.at_most[at_answer - 1] >= 1
+    assert curve.violated[0] == one.curve.violated[0]
+    assert (curve.violated <= curve.at_most).all()

@@ -18,16 +18,16 @@ _SIZE_IN = (10.0, 5.2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftCurve:
-    """One recording at S shifts.
+    """One recording, between one shift and the next.
 
     Attributes
     ----------
     name : str
         What it is called.
-    shift_mm : (S,) float64
-        Ascending.
+    shift_mm : (S + 1,) float64
+        Where the number of frames may change, ascending.
     violated, at_most : (S,) float64
-        Frames that certainly violate, and these with all that may.
+        Frames that certainly violate between them, and these with all that may.
     answer_mm : float
         The smallest shift that none violates; NaN if there is none.
     """
@@ -87,9 +87,22 @@ def draw_spacing_chart(curves: Sequence[ShiftCurve], *, title: str) -> Figure:
                 clip_on=False,
                 zorder=5,
             )
-        axes.plot(curve.shift_mm, curve.violated, color=colour, linewidth=width, label=label)
-        axes.fill_between(
-            curve.shift_mm, curve.violated, curve.at_most, color=colour, alpha=0.3, linewidth=0
+        axes.stairs(
+            curve.violated,
+            curve.shift_mm,
+            baseline=None,
+            color=colour,
+            linewidth=width,
+            label=label,
+        )
+        axes.stairs(
+            curve.at_most,
+            curve.shift_mm,
+            baseline=curve.violated,
+            fill=True,
+            color=colour,
+            alpha=0.3,
+            linewidth=0,
         )
     axes.set_xlabel("moved by, mm")
     axes.set_ylabel("frames that violate")
