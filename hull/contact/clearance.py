@@ -35,8 +35,9 @@ from hybridve.hull.contact.lattice import (
 from hybridve.hull.query.cells import CellFrame, are_inside, make_cell_frame, split_cells
 from hybridve.hull.query.silhouettes import Hull
 
-#: Half of the root's edge at least, metres, and in sizes of the object: farther is not looked.
-_REACH_M, _REACH_SIZES = 16.0, 4.0
+#: Half of the first root's edge at least, metres, and in sizes of the object. Farther than 16 times
+#: that is not looked.
+_NEAR_M, _REACH_SIZES = 1.0, 2.0
 
 #: Cubes with a half diagonal below this share of the tolerance are not cut any further. Where cones
 #: cross at a glancing angle the hull ends in a blade, which only cubes as thin as it is can tell
@@ -141,9 +142,10 @@ class ClearanceMeter:
         self._surface = SurfaceDistance(
             vertices_world - self._origin_world, faces, is_closed=is_closed
         )
-        self._half_m = float(2.0 ** np.ceil(np.log2(max(_REACH_M, _REACH_SIZES * size_m))))
-        self._reach_m = self._half_m - size_m
-        self._lattice = DistanceLattice(self._surface, self._half_m)
+        self._size_m = size_m
+        exponent = int(np.ceil(np.log2(max(_NEAR_M, _REACH_SIZES * size_m))))
+        self._roots_m = [2.0 ** (exponent + more) for more in (0, 2, 4)]
+        self._lattice = DistanceLattice(self._surface, self._roots_m[-1])
 
     def closest(
         self, points_world: NDArray[np.float64]
@@ -181,19 +183,55 @@ class ClearanceMeter:
         """
         shift_world = np.zeros(3) if shift_world is None else shift_world
         origin_world = self._origin_world + shift_world
-        asked = make_cell_frame(hull, origin_world, self._half_m)
+        asked = make_cell_frame(hull, origin_world, self._roots_m[-1])
         if self._lattice.is_large:
             self._lattice.forget()
         best = Best(np.full(1, np.inf), np.full(3, np.nan))
-        half_m, fine_m = self._half_m, _FINE * self.tolerance_m
+        # Most of the hull is near: space is looked through in ever larger cubes about the object,
+        # until what may be beyond them does not matter.
+        for root_m in self._roots_m:
+            beyond_m = root_m - self._size_m
+            lowest_m = self._search(root_m, best, asked, stop_above_m, stop_below_m)
+            if best.distance_m[0] <= beyond_m or min(lowest_m, beyond_m) > stop_above_m:
+                break
+        upper_m: float = np.inf
+        on_object = best.point
+        if best.distance_m[0] < np.inf:  # the exact distance of the best point
+            signed_m, nearest = self._surface.signed(best.point[None])
+            upper_m, on_object = float(signed_m[0]), nearest[0]
+        least_m = min(lowest_m, upper_m, beyond_m) - _ROUNDOFF * root_m
+        return Clearance(
+            lower_m=max(least_m, 0.0),
+            upper_m=max(upper_m, 0.0),
+            on_object_world=on_object + origin_world,
+            on_hull_world=best.point + origin_world,
+            depth_lower_m=max(-upper_m, 0.0) if self.is_closed else np.nan,
+            depth_upper_m=max(-least_m, 0.0) if self.is_closed else np.nan,
+        )
+
+    def _search(
+        self,
+        root_m: float,
+        best: Best,
+        asked: CellFrame,
+        stop_above_m: float,
+        stop_below_m: float,
+    ) -> float:
+        """Look for the hull's nearest point in a cube of half edge `root_m`, better than `best`.
+
+        Returns a lower bound of the signed distance of any point of the hull in it, unless that is
+        the distance of `best` itself; inf if it holds none.
+        """
+        half_m, fine_m = root_m, _FINE * self.tolerance_m
         center, cube = np.zeros((1, 3)), np.zeros(1, np.int64)
         cubes = self._lattice.cubes(center, half_m, fine_m)
         dropped_m, lowest_m = np.inf, -np.inf
-        for level in range(1, _MOST_LEVELS):
+        finest_m = self._roots_m[-1] / 2.0**FINEST_LEVEL
+        for _ in range(_MOST_LEVELS):
             half_m /= 2.0
             whole, center, inside = split_cells(center, half_m, asked)
             cube = cube[whole]
-            if level <= FINEST_LEVEL:
+            if half_m >= finest_m:
                 own = ~cubes.is_fine[cube]
                 cube[own] = len(cubes.half_m) + np.arange(int(own.sum()))
                 cubes = _joined(cubes, self._lattice.cubes(center[own], half_m, fine_m))
@@ -223,21 +261,7 @@ class ClearanceMeter:
                 or best.distance_m[0] < stop_below_m
             ):
                 break
-        upper_m: float = np.inf
-        on_object = best.point
-        if best.distance_m[0] < np.inf:  # the exact distance of the best point
-            signed_m, nearest = self._surface.signed(best.point[None])
-            upper_m, on_object = float(signed_m[0]), nearest[0]
-        least_m = float(min(lowest_m, dropped_m, upper_m, self._reach_m))
-        least_m -= _ROUNDOFF * self._half_m
-        return Clearance(
-            lower_m=max(least_m, 0.0),
-            upper_m=max(upper_m, 0.0),
-            on_object_world=on_object + origin_world,
-            on_hull_world=best.point + origin_world,
-            depth_lower_m=max(-upper_m, 0.0) if self.is_closed else np.nan,
-            depth_upper_m=max(-least_m, 0.0) if self.is_closed else np.nan,
-        )
+        return float(min(dropped_m, lowest_m))
 
     def _look_deeper(
         self,
