@@ -18,6 +18,9 @@ PACKAGES = (
     "scipy",
     "open3d-cpu",
     "open3d",
+    "trimesh",
+    "pycollada",
+    "cascadio",
 )
 
 
