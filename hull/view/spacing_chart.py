@@ -110,6 +110,7 @@ def draw_spacing_chart(curves: Sequence[ShiftCurve], *, title: str) -> Figure:
     axes.set_xlim(float(curves[0].shift_mm[0]), float(curves[0].shift_mm[-1]))
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(color="#DDDDDD", linewidth=0.5)
+    axes.set_axisbelow(True)
     axes.legend(title="smallest shift that no frame violates", fontsize=8, title_fontsize=8)
     figure.suptitle("\n".join(textwrap.wrap(title, 100)), fontsize=10)
     return figure
