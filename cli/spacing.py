@@ -108,9 +108,9 @@ def spacing(
 ) -> None:
     r"""Find the smallest shift of an object at which the whole recording keeps clear of it.
 
-    The shift found is proved to keep the required clearance in every frame; so is that a shift
-    smaller by more than the tolerance does not, as a rule, and "at least" says what is certain.
-    Each recording is replayed once, for all shifts. Several SESSIONs are columns of the table.
+    The shift found is proved to keep the required clearance in every frame, and that the smallest
+    one is "at least" so much is proved too; as a rule less than the tolerance lies between. Each
+    recording is replayed once, for all shifts. Several SESSIONs are columns of the table.
 
     \b
     Example:
@@ -135,6 +135,8 @@ def spacing(
     cv2.setNumThreads(1)
     if picture is not None and picture.suffix.lower() not in SUFFIXES:
         raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
+    if picture is not None and picture == output:
+        raise click.UsageError(f"{output} cannot be both spacing and picture")
     for path in (output, picture):
         if path is not None:
             refuse_existing(path, overwrite=overwrite)
@@ -291,7 +293,7 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
 
 
 def _ranges(one: "SessionSpacing") -> str:
-    """Return where the clearance is kept, the widest ranges first in mind, in ascending order."""
+    """Return where the clearance is kept, in ascending order."""
     ranges = [f"{_mm(low)} to {_mm(high)}" for low, high in one.free_m.tolist()]
     if len(ranges) > _MOST_RANGES:
         ranges = [*ranges[:_MOST_RANGES], f"{len(one.free_m) - _MOST_RANGES} more"]

@@ -147,6 +147,7 @@ def test_a_session_given_twice_is_one_line(
         (["--range-mm", "100"], "'100' is not A:B"),
         (["--tolerance-mm", "0"], "0.01"),
         (["--picture", "out.gif"], "pictures are .png"),
+        (["--picture", "out.png", "-o", "out.png"], "cannot be both"),
     ],
 )
 def test_wrong_usage_is_status_2_and_says_what(
