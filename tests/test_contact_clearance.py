@@ -102,8 +102,9 @@ def test_touching_is_no_distance() -> None:
     views = ring_views()
     hull = make_hull(views, ball_masks(views, np.zeros(3), 0.05))
     found = ClearanceMeter(*sheet(0.5, 0.01), is_closed=False).measure(hull)
-    assert found.lower_m == 0
-    assert found.upper_m <= 1e-4
+    assert (found.lower_m, found.upper_m) == (0, 0)
+    np.testing.assert_allclose(found.on_hull_world[2], 0.01)
+    assert contains_points(hull, found.on_hull_world[None])[0]
     assert np.isnan(found.depth_lower_m)
 
 

@@ -271,13 +271,17 @@ class ClearanceMeter:
         asked: CellFrame,
         n_looks: int,
     ) -> None:
-        """Follow the way from the surface through a point (3,) of the hull, into the solid.
+        """Look at a point (3,) of the hull, at the surface beside it, and behind that.
 
-        The depth grows by a metre a metre until another side of the solid is as near. What is
-        found is taken if it betters the best point; its distance is exact.
+        On the way from the surface through the point into the solid, the depth grows by a metre a
+        metre until another side of the solid is as near. What is found is taken if it betters the
+        best point; its distance is exact.
         """
         signed_m, nearest = self._surface.signed(point[None])
-        if signed_m[0] < best.distance_m[0]:
+        if signed_m[0] > 0 and are_inside(nearest, asked)[0]:
+            if best.distance_m[0] > 0:
+                best.distance_m[0], best.point[:] = 0.0, nearest[0]
+        elif signed_m[0] < best.distance_m[0]:
             best.distance_m[0], best.point[:] = signed_m[0], point
         away = point - nearest[0]
         length_m = float(np.linalg.norm(away))

@@ -374,7 +374,8 @@ def bound_cells(
     lower_m : (N,) float64
     deepest : int
         The cell with the lowest bound of those whose centre is in the hull and may lie in the
-        solid, -1 if there is none: its exact distance may better the best one.
+        solid, else the one nearest to the surface of those that this may cross; -1 if there is
+        none. Its exact distance may better the best one.
     """
     frame = asked.frame
     offset_x, offset_y, offset_z = asked.offset_local
@@ -386,7 +387,7 @@ def bound_cells(
     )
     keep, min_cameras = frame.keep, frame.min_cameras
     lower_m, value = np.zeros(len(center)), np.zeros(8)
-    deepest, smallest_m = ZERO - 1, best.distance_m[0]
+    deepest, key, smallest_m = ZERO - 1, np.inf, best.distance_m[0]
     for i in range(len(center)):
         x, y, z = center[i, 0], center[i, 1], center[i, 2]
         k = cube[i]
@@ -410,8 +411,8 @@ def bound_cells(
         if not inside[i] or lower_m[i] >= smallest_m:
             continue
         if side != _OUTSIDE:
-            if deepest < 0 or lower_m[i] < lower_m[deepest]:
-                deepest = i
+            if lower_m[i] < key:
+                deepest, key = i, lower_m[i]
             continue
         closest, squared = 0, np.inf
         for octant in range(8):
@@ -421,6 +422,8 @@ def bound_cells(
             if to_x * to_x + to_y * to_y + to_z * to_z < squared:
                 closest, squared = octant, to_x * to_x + to_y * to_y + to_z * to_z
         upper_m = np.sqrt(squared)
+        if lower_m[i] <= 0 and upper_m < key:
+            deepest, key = i, upper_m
         if upper_m - half_m >= smallest_m:
             continue
         to_x = nearest[corner[closest], 0] - x
