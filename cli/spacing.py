@@ -73,6 +73,14 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     show_default=True,
     help="How narrowly the smallest shift is wanted.",
 )
+@click.option(
+    "--grow-px",
+    type=click.IntRange(0, 100),
+    default=0,
+    show_default=True,
+    help="Grow all silhouettes by so many pixels, for room to spare: the answer then holds for "
+    "outlines that are off by less.",
+)
 @options.frames_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="The file to write, SPACING.h5."
@@ -98,6 +106,7 @@ def spacing(
     range_mm: tuple[float, float],
     clearance_mm: float | None,
     tolerance_mm: float,
+    grow_px: int,
     frames: "FrameRange",
     output: Path | None,
     picture: Path | None,
@@ -162,6 +171,7 @@ def spacing(
                     chain,
                     layout,
                     shifts_m,
+                    grow_px=grow_px,
                     progress=StageProgress(enabled=progress),
                     advance=advance,
                 )
@@ -180,6 +190,7 @@ def spacing(
             "start_m": move.start_m,
             "stop_m": move.stop_m,
             "tolerance_m": move.tolerance_m,
+            "grow_px": grow_px,
             "frames": str(frames),
         },
         sessions=tuple(found),
@@ -235,6 +246,7 @@ def _print_result(found: "Spacing") -> None:
     click.echo(
         f"{', '.join(settings['move'])} moved along ({direction}), {1e3 * settings['start_m']:g} "
         f"to {1e3 * settings['stop_m']:g} mm, to keep {', '.join(required)} mm"
+        + (f", silhouettes grown by {settings['grow_px']} px" if settings["grow_px"] else "")
     )
     columns = [_column(one) for one in found.sessions]
     labels = [label for label in columns[0] if any(column[label] for column in columns)]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.hull.capture.recording import silhouettes_of
 from hybridve.hull.contact.clearance import ClearanceMeter
+from hybridve.hull.contact.components import grown
 from hybridve.hull.contact.scene import Scene, SceneObject
 from hybridve.hull.contact.spacing import (
     METER_SHARE,
@@ -144,6 +145,7 @@ def replay(
     layout: Layout,
     shifts_m: NDArray[np.float64],
     *,
+    grow_px: int = 0,
     progress: Callable[[str, int, int], None] | None = None,
     advance: Callable[[], object] = lambda: None,
 ) -> SessionSpacing:
@@ -159,6 +161,9 @@ def replay(
         What is moved.
     shifts_m : (S,) float64
         Where to count the frames that violate, ascending.
+    grow_px : int
+        By how many pixels all silhouettes are grown: the answer then holds for any outlines that
+        are no farther out.
     progress : callable, optional
         Told ``(what, done, total)`` while the backgrounds are learnt.
     advance : callable
@@ -183,7 +188,8 @@ def replay(
             if frame.masks is None:
                 tally.leave_out(frame.index, time_s, frame.reason)
             else:
-                tally.look(frame.index, time_s, make_hull(chain.views, frame.masks))
+                hull = make_hull(chain.views, frame.masks)
+                tally.look(frame.index, time_s, grown(hull, grow_px) if grow_px else hull)
             advance()
     if not tally.n_valid:
         raise SessionError(

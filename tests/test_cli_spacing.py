@@ -55,6 +55,20 @@ def test_sessions_are_columns_and_who_reaches_farther_needs_more(
     assert lines[-1].startswith("not moved, and violated all the same: post in ")
 
 
+def test_silhouettes_are_grown_on_demand_and_that_is_said(
+    run: Run, task: list[object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = []
+    for extra in ((), ("--grow-px", 2)):
+        assert run(*task, *extra, "--json") == 0
+        printed = json.loads(capsys.readouterr().out)
+        assert printed["settings"]["grow_px"] == (2 if extra else 0)
+        answers.append([one["shift_m"] for one in printed["sessions"]])
+    assert all(wider > narrow for narrow, wider in zip(*answers, strict=True))
+    assert run(*task, "--grow-px", 2) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith(", silhouettes grown by 2 px")
+
+
 def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     run: Run, task: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -77,6 +77,23 @@ def test_the_shift_found_keeps_the_clearance_in_every_frame_and_a_smaller_one_do
     assert found.free_m.tolist() == [[found.shift_m, MOVE.stop_m]]
 
 
+def test_wider_outlines_need_more_room_and_block_what_was_blocked(
+    chain: Chain, layout: Layout, found: SessionSpacing
+) -> None:
+    """A grown hull holds the hull, so that every shift it lets be, the other does too."""
+    before = found
+    for grow_px in (1, 3):
+        wider = replay("wider", chain, layout, shifts_of(MOVE), grow_px=grow_px)
+        for row in range(len(CENTERS)):
+            blocked = before.frames.violated.of(row)
+            middles_m = blocked.mean(axis=1)
+            assert covers(
+                union(wider.frames.violated.of(row), wider.frames.undecided.of(row)), middles_m
+            ).all()
+        assert wider.shift_m > before.shift_m + 1e-3
+        before = wider
+
+
 def test_the_frame_that_decides_is_the_one_that_comes_nearest(found: SessionSpacing) -> None:
     binding = found.binding
     assert binding is not None
