@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings
 from hybridve.hull.contact.clearance import ClearanceMeter
+from hybridve.hull.contact.components import connected_volumes
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.jit import FOLDER
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Views, make_hull, make_views
+from hybridve.hull.query.walk import spans_in_hull
 
 #: Side in pixels of the images that are compiled with.
 _SIDE_PX = 64
@@ -64,7 +66,11 @@ def _run_kernels() -> None:
             detect_contacts(hull, [sheet], engine)
             certifier.certify_mesh(hull, sheet.triangles)
     mesh = sheet.triangles
-    ClearanceMeter(mesh.vertices_world, mesh.faces, is_closed=False).measure(hull)
+    meter = ClearanceMeter(mesh.vertices_world, mesh.faces, is_closed=False)
+    for shift_world in (np.zeros(3), np.array([3.0, 0.0, 1.0])):  # touched, and far beside
+        meter.measure(hull, shift_world)
+    spans_in_hull(hull, np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0)
+    connected_volumes(hull)
 
 
 def _views() -> Views:

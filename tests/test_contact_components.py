@@ -21,7 +21,7 @@ from hybridve.hull.contact.components import (
     cover,
     grown,
     is_real,
-    pixel_ray,
+    pixel_rays,
 )
 from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.reference import contains_points
@@ -175,8 +175,8 @@ def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
     views = hull.views
     camera = int(rng.integers(len(views)))
     width, height = views.sizes_px[camera]
-    origin, direction = pixel_ray(
-        views, camera, int(rng.integers(width)), int(rng.integers(height))
+    origin, (direction,) = pixel_rays(
+        views, camera, [(int(rng.integers(width)), int(rng.integers(height)))]
     )
 
     spans_m = spans_in_hull(hull, origin, direction, 6.0)

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
-from hybridve.hull.contact.components import FAR_M, pixel_ray
+from hybridve.hull.contact.components import FAR_M, pixel_rays
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.walk import spans_in_hull
+from hybridve.hull.query.walk import spans_of_rays
 
 #: Where rays are tried for a bound of the real thing's distance: at the nearest point's projection,
 #: and in the most promising cameras at these distances about it, in eight directions.
@@ -58,20 +58,17 @@ def real_upper(hull: Hull, grown_hull: Hull, meter: ClearanceMeter, clearance: C
     if not np.isfinite(clearance.on_hull_world).all():
         return np.inf
 
-    def promises(asked: list[tuple[int, int, int]]) -> list[_Promise]:
-        return [
-            _Promise(promise_m, camera, ray)
-            for camera, column, row in asked
-            if (ray := _walk_pixel(grown_hull, camera, column, row)) is not None
-            for promise_m in [float(meter.signed_distance(ray.ends_world).max())]
-        ]
-
     pixels = [
         _pixels_about(hull, camera, clearance.on_hull_world) for camera in range(len(hull.views))
     ]
-    tried = promises([(camera, *found[0]) for camera, found in enumerate(pixels) if found])
+    tried = _promises(grown_hull, meter, [found[:1] for found in pixels])
     best = sorted(tried, key=lambda promise: promise.at_least_m)[:_CLOSE_CAMERAS]
-    tried += promises([(p.camera, *pixel) for p in best for pixel in pixels[p.camera][1:]])
+    close = {promise.camera for promise in best}
+    tried += _promises(
+        grown_hull,
+        meter,
+        [found[1:] if camera in close else [] for camera, found in enumerate(pixels)],
+    )
     bound_m = np.inf
     for promise in sorted(tried, key=lambda promise: promise.at_least_m)[:_CLOSE_RAYS]:
         if promise.at_least_m >= bound_m:
@@ -105,11 +102,38 @@ class _Promise(NamedTuple):
     ray: Ray
 
 
-def _walk_pixel(grown_hull: Hull, camera: int, column: int, row: int) -> Ray | None:
-    """Return the ray of a pixel; None where the silhouettes contradict each other."""
-    origin_world, direction = pixel_ray(grown_hull.views, camera, column, row)
-    spans_m = spans_in_hull(grown_hull, origin_world, direction, FAR_M)
-    return Ray(origin_world, direction, spans_m) if len(spans_m) else None
+def _promises(
+    grown_hull: Hull, meter: ClearanceMeter, pixels: list[list[tuple[int, int]]]
+) -> list[_Promise]:
+    """Return what the rays of each camera's pixels promise.
+
+    Where silhouettes contradict each other, a ray may miss the hull: it is left out.
+    """
+    origins, directions = [], []
+    cameras = [camera for camera, found in enumerate(pixels) for _ in found]
+    for camera in dict.fromkeys(cameras):
+        origin_world, units = pixel_rays(grown_hull.views, camera, pixels[camera])
+        origins.append(np.tile(origin_world, (len(units), 1)))
+        directions.append(units)
+    if not cameras:
+        return []
+    origins_world, units = np.concatenate(origins), np.concatenate(directions)
+    walked = spans_of_rays(grown_hull, origins_world, units, FAR_M)
+    rays = [
+        (camera, Ray(*ray))
+        for camera, *ray in zip(cameras, origins_world, units, walked, strict=True)
+        if len(ray[2])
+    ]
+    if not rays:
+        return []
+    ends_world = [ray.ends_world for _, ray in rays]
+    distances_m = meter.signed_distance(np.concatenate(ends_world))
+    first = np.cumsum([0, *map(len, ends_world[:-1])])
+    promised_m = np.maximum.reduceat(distances_m, first).tolist()
+    return [
+        _Promise(at_least_m, camera, ray)
+        for at_least_m, (camera, ray) in zip(promised_m, rays, strict=True)
+    ]
 
 
 def _pixels_about(

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from hybridve.hull.jit import ZERO, compiled, inlined
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
 from hybridve.hull.query.walk import spans_in_hull
@@ -88,14 +89,20 @@ def grown(hull: Hull, by_px: int = GROWN_PX) -> Hull:
     )
 
 
-def pixel_ray(
-    views: Views, camera: int, column: int, row: int
+def pixel_rays(
+    views: Views, camera: int, pixels: list[tuple[int, int]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the ray of a pixel's centre: where it begins, metres, and a unit vector; world."""
+    """Return the rays of pixels' centres: where they begin (3,), metres, and unit vectors (N, 3).
+
+    World frame; pixels are columns and rows.
+    """
     matrix = views.img_from_local[camera]
-    origin_world = views.origin_world - np.linalg.solve(matrix[:, :3], matrix[:, 3])
-    direction = np.linalg.solve(matrix[:, :3], [column + 0.5, row + 0.5, 1.0])
-    return origin_world, direction / np.linalg.norm(direction)
+    inverse = np.linalg.inv(matrix[:, :3])
+    column, row = np.array(pixels, np.float64).reshape(-1, 2).T[:, :, None] + 0.5
+    # Sums written out: a product of matrices is rounded as its size makes it.
+    directions = inverse[:, 0] * column + inverse[:, 1] * row + inverse[:, 2]
+    directions /= np.sqrt((directions**2).sum(axis=1))[:, None]
+    return views.origin_world - inverse @ matrix[:, 3], directions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +209,16 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
     octants = np.indices((2, 2, 2)).reshape(3, -1).T
     blocks = []
     while True:
-        is_free, is_full = _tell(hull, np.asarray(cells + 0.5 * side) * cell_m, 0.5 * side * cell_m)
+        is_free, is_full = _tell(
+            np.ascontiguousarray((cells + 0.5 * side) * cell_m, np.float64),
+            0.5 * side * cell_m,
+            np.ascontiguousarray(matrices),
+            np.ascontiguousarray(hull.views.sizes_px),
+            hull.integrals_flat,
+            hull.integral_offset,
+            hull.views.unseen == "keep",
+            int(hull.views.min_cameras),
+        )
         if side == 1:
             blocks.append((cells[~is_free], 1))
             return blocks
@@ -215,81 +231,139 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
         cells = (cells[is_open, None] + octants * side).reshape(-1, 3)
 
 
+@compiled
 def _tell(
-    hull: Hull, centers_local: NDArray[np.float64], half_m: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which cubes (N, 3) hold no point of the hull, proved, and which hold nothing else."""
-    views = hull.views
-    keeps = views.unseen == "keep"
-    is_free = np.zeros(len(centers_local), np.bool_)
-    may_see = np.zeros(len(centers_local), np.int64)
-    n_full = np.zeros(len(centers_local), np.int64)
-    rest = np.arange(len(centers_local))  # not free so far
-    for camera in range(len(views)):
-        seen, full, none = _look(hull, camera, centers_local[rest], half_m)
-        may_see[rest] += seen
-        n_full[rest] += full
-        is_free[rest] = none if keeps else none | ~seen
-        rest = rest[~is_free[rest]]
-    if not keeps:
-        return is_free, n_full == len(views)
-    is_free |= may_see < views.min_cameras
-    return is_free, ~is_free & (n_full == may_see) & (n_full >= views.min_cameras)
-
-
-def _look(
-    hull: Hull, camera: int, centers_local: NDArray[np.float64], half_m: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return of which cubes a camera may see a point; sees object only; sees background only."""
-    width, height = hull.views.sizes_px[camera].tolist()
-    matrix = hull.views.img_from_local[camera]
-    x, y, reach_x, reach_y, near_m, far_m = _rectangles(matrix, centers_local, half_m)
-    in_front = near_m > _NEAR_M
-    left, right = np.floor(x - reach_x), np.floor(x + reach_x)
-    top, bottom = np.floor(y - reach_y), np.floor(y + reach_y)
-    is_seen_wholly = in_front & (left >= 0) & (top >= 0) & (right < width) & (bottom < height)
-    # What straddles the camera's plane projects anywhere.
-    left, top = np.where(in_front, left, 0.0), np.where(in_front, top, 0.0)
-    right, bottom = np.where(in_front, right, width), np.where(in_front, bottom, height)
-    x0 = np.clip(left, 0, width).astype(np.int64)
-    x1 = np.clip(right + 1, 0, width).astype(np.int64)
-    y0 = np.clip(top, 0, height).astype(np.int64)
-    y1 = np.clip(bottom + 1, 0, height).astype(np.int64)
-    may_see = (x0 < x1) & (y0 < y1) & (far_m > -_NEAR_M)
-    straddles = np.flatnonzero(may_see & ~in_front)
-    may_see[straddles] = _may_be_seen(matrix, width, height, centers_local[straddles], half_m)
-    integral = hull.integral(camera).ravel()
-    stride = width + 1
-    count = (
-        integral[y1 * stride + x1]
-        - integral[y0 * stride + x1]
-        - integral[y1 * stride + x0]
-        + integral[y0 * stride + x0]
-    )
-    sees_none = count == 0
-    if hull.views.unseen == "keep":
-        sees_none &= is_seen_wholly  # beyond its border a camera abstains
-    return may_see, is_seen_wholly & (count == (x1 - x0) * (y1 - y0)), sees_none & may_see
-
-
-def _may_be_seen(
-    matrix: NDArray[np.float64],
-    width: int,
-    height: int,
     centers_local: NDArray[np.float64],
     half_m: float,
-) -> NDArray[np.bool_]:
-    """Tell which cubes (N, 3) may hold a point that projects into the image: (N,).
+    matrices: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    integrals: NDArray[np.int32],
+    integral_offset: NDArray[np.int64],
+    keep: bool,
+    min_cameras: int,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which cubes (N, 3) hold no point of the hull, proved, and which hold nothing else."""
+    is_free = np.zeros(len(centers_local), np.bool_)
+    is_full = np.zeros(len(centers_local), np.bool_)
+    for i in range(len(centers_local)):
+        x, y, z = centers_local[i]
+        n_seeing, n_full, n_none = ZERO, ZERO, ZERO
+        for camera in range(len(matrices)):
+            seen, full, none = _look(
+                x,
+                y,
+                z,
+                half_m,
+                matrices[camera],
+                sizes[camera, 0],
+                sizes[camera, 1],
+                integrals,
+                integral_offset[camera],
+                keep,
+            )
+            n_seeing += seen
+            n_full += full
+            n_none += none or not (seen or keep)
+            if n_none:
+                break
+        needed = min_cameras if keep else len(matrices)
+        is_free[i] = n_none > 0 or n_seeing < needed
+        is_full[i] = not is_free[i] and n_full == n_seeing
+    return is_free, is_full
+
+
+@inlined
+def _look(
+    x: float,
+    y: float,
+    z: float,
+    half_m: float,
+    m: NDArray[np.float64],
+    width: int,
+    height: int,
+    integrals: NDArray[np.int32],
+    first: int,
+    keep: bool,
+) -> tuple[bool, bool, bool]:
+    """Tell of a cube: a camera may see it; sees object only; sees background only."""
+    depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    thick_m = half_m * (abs(m[2, 0]) + abs(m[2, 1]) + abs(m[2, 2]))
+    if depth_m + thick_m <= -_NEAR_M:
+        return False, False, False
+    if depth_m - thick_m <= _NEAR_M:  # it straddles the camera's plane, and projects anywhere
+        if not _may_be_seen(x, y, z, half_m, m, width, height):
+            return False, False, False
+        x0, x1, y0, y1 = 0, width, 0, height
+        is_seen_wholly = False
+    else:
+        per_depth, scale = 1.0 / depth_m, half_m / (depth_m - thick_m)
+        left, right = _interval(x, y, z, m[0], m[2], per_depth, scale)
+        top, bottom = _interval(x, y, z, m[1], m[2], per_depth, scale)
+        if right < 0 or bottom < 0 or left >= width or top >= height:
+            return False, False, False
+        is_seen_wholly = left >= 0 and top >= 0 and right < width and bottom < height
+        x0, x1 = int(max(left, 0.0)), int(min(right + 1.0, float(width)))
+        y0, y1 = int(max(top, 0.0)), int(min(bottom + 1.0, float(height)))
+    above, below = first + y0 * (width + 1), first + y1 * (width + 1)
+    count = (
+        integrals[below + x1]
+        - integrals[above + x1]
+        - integrals[below + x0]
+        + integrals[above + x0]
+    )
+    # Beyond its border a camera that keeps abstains.
+    sees_none = count == 0 and (is_seen_wholly or not keep)
+    return True, is_seen_wholly and count == (x1 - x0) * (y1 - y0), sees_none
+
+
+@inlined
+def _interval(
+    x: float,
+    y: float,
+    z: float,
+    row: NDArray[np.float64],
+    third: NDArray[np.float64],
+    per_depth: float,
+    scale: float,
+) -> tuple[float, float]:
+    """Return the first and the last column (or row) of the rectangle around a cube."""
+    middle = (row[0] * x + row[1] * y + row[2] * z + row[3]) * per_depth
+    spread = (
+        abs(row[0] - middle * third[0])
+        + abs(row[1] - middle * third[1])
+        + abs(row[2] - middle * third[2])
+    )
+    reach = scale * spread + _ROUNDING_PX
+    return np.floor(middle - reach), np.floor(middle + reach)
+
+
+@compiled
+def _may_be_seen(
+    x: float,
+    y: float,
+    z: float,
+    half_m: float,
+    m: NDArray[np.float64],
+    width: int,
+    height: int,
+) -> bool:
+    """Tell whether a cube may hold a point that projects into the image.
 
     Such a point is on the inner side of each of the four planes through the camera's centre and
     the image's borders. A cube is beyond a plane if its innermost corner is; by `_NEAR_M` in
     homogeneous pixels, to be sure of rounding.
     """
-    x, y, depth = matrix
-    inward = np.stack([x, width * depth - x, y, height * depth - y])  # (4, 4)
-    innermost = centers_local @ inward[:, :3].T + inward[:, 3]
-    innermost += half_m * np.abs(inward[:, :3]).sum(axis=1)
-    return np.asarray((innermost >= -_NEAR_M).all(axis=1))
+    for axis in range(2):
+        for border in range(2):
+            sign, of_depth = (-1.0, float(height if axis else width)) if border else (1.0, 0.0)
+            a = sign * m[axis, 0] + of_depth * m[2, 0]
+            b = sign * m[axis, 1] + of_depth * m[2, 1]
+            c = sign * m[axis, 2] + of_depth * m[2, 2]
+            innermost = a * x + b * y + c * z + sign * m[axis, 3] + of_depth * m[2, 3]
+            innermost += half_m * (abs(a) + abs(b) + abs(c))
+            if innermost < -_NEAR_M:
+                return False
+    return True
 
 
 def _rectangles(
@@ -441,7 +515,7 @@ def _evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 def _is_all_in(volumes: Volumes, camera: int, column: int, row: int, volume: int) -> bool:
     """Tell whether the ray of a pixel's centre is in the hull, and there in one volume only."""
-    origin_world, direction = pixel_ray(volumes.hull.views, camera, column, row)
+    origin_world, (direction,) = pixel_rays(volumes.hull.views, camera, [(column, row)])
     spans_m = spans_in_hull(volumes.hull, origin_world, direction, FAR_M)
     # A stretch in the hull is connected: its middle tells for all of it.
     middles_world = origin_world + spans_m.mean(axis=1)[:, None] * direction

@@ -7,13 +7,17 @@ the ray's point at t, it crosses column k where h_x = k h_z:
     t = (k h0_z - h0_x) / (h1_x - k h1_z)
 
 and rows alike. Between two crossings one pixel answers for all points, so asking it once, in the
-middle, is exact: nothing hides between samples. Each camera's answers are then laid over each
-other by the rule of `hybridve.hull.query.silhouettes`.
+middle, is exact: nothing hides between samples. Camera after camera takes its background away
+from what the rule of `hybridve.hull.query.silhouettes` leaves where all pixels are object pixels.
+`hybridve.hull.query.walk_reference` is the specification.
 """
+
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.silhouettes import Hull
 
 #: Stretches and gaps shorter than this are not told: rounding makes them where a ray crosses a
@@ -22,6 +26,9 @@ ROUNDING_M = 1e-12
 
 #: How far `boundary_cameras` looks to either side of a boundary point.
 _LOOK_M = 1e-9
+
+#: Less counts as this, lest a pixel be divided by zero.
+_LEAST_DEPTH_M = float(np.finfo(np.float64).tiny)
 
 #: What a camera says of a point: it does not see it, it sees background, it sees an object pixel.
 _UNSEEN, _BACKGROUND, _OBJECT = -1, 0, 1
@@ -65,18 +72,62 @@ def spans_in_hull(
     ValueError
         If the direction has no length, or the reach is not a positive length.
     """
+    return spans_of_rays(hull, origin_world[None], direction[None], reach_m)[0]
+
+
+def spans_of_rays(
+    hull: Hull,
+    origins_world: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    reach_m: float,
+) -> list[NDArray[np.float64]]:
+    """Return what `spans_in_hull` does, to the bit, for each of many rays.
+
+    Parameters
+    ----------
+    hull : Hull
+        The visual hull of one frame.
+    origins_world : (R, 3) float64
+        Where the rays begin, metres.
+    directions : (R, 3) float64
+        Where they go, world frame; of any length but 0.
+    reach_m : float
+        How far they go, metres.
+
+    Returns
+    -------
+    list of R (N, 2) float64
+        The stretches of each ray.
+
+    Raises
+    ------
+    ValueError
+        If a direction has no length, or the reach is not a positive length.
+    """
     if not 0 < reach_m < np.inf:
         raise ValueError(f"reach_m is {reach_m}, expected a positive length")
     views = hull.views
-    start_local = origin_world - views.origin_world
-    unit = _unit(direction)
-    begin = views.img_from_local[:, :, :3] @ start_local + views.img_from_local[:, :, 3]  # (C, 3)
-    step = views.img_from_local[:, :, :3] @ unit
-    first_m, last_m = _seen_range(begin, step, views.sizes_px, reach_m)
-    if views.unseen == "carve":  # what one camera does not see, none need look at
-        first_m[:], last_m[:] = first_m.max(), last_m.min()
-    edges_m, states = _walk(hull, begin, step, first_m, last_m, reach_m)
-    return _joined(edges_m, _is_inside(hull, states))
+    units = np.zeros((len(directions), 3))
+    for unit, direction in zip(units, directions, strict=True):
+        unit[:] = _unit(direction)
+    starts_local = origins_world - views.origin_world
+    x, y, z = np.moveaxis(views.img_from_local[:, :, :3], 2, 0)  # (C, 3) each
+    # Sums written out: a product of matrices is rounded as its size makes it.
+    begin, step = (
+        x * v[:, 0, None, None] + y * v[:, 1, None, None] + z * v[:, 2, None, None]
+        for v in (starts_local, units)
+    )  # (R, C, 3)
+    spans_m, offset = _walk(
+        begin + views.img_from_local[:, :, 3],
+        step,
+        float(reach_m),
+        np.ascontiguousarray(views.sizes_px),
+        hull.masks_flat,
+        hull.mask_offset,
+        views.unseen == "keep",
+        int(views.min_cameras),
+    )
+    return [spans_m[i:j] for i, j in itertools.pairwise(offset.tolist())]
 
 
 def contains_few(hull: Hull, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -200,70 +251,239 @@ def _unit(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     return unit
 
 
+@compiled
 def _seen_range(
     begin: NDArray[np.float64],
     step: NDArray[np.float64],
-    sizes_px: NDArray[np.int64],
+    width: int,
+    height: int,
     reach_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return from where (C,) to where (C,) cameras see a ray; empty where the first is not less.
+) -> tuple[float, float]:
+    """Return from where to where a camera sees a ray; twice infinity where it does not.
 
-    In front and in the image are five conditions g0 + t g1 >= 0 (C, 5).
+    In front and in the image are five conditions g0 + t g1 >= 0.
     """
-    width, height = sizes_px[:, 0], sizes_px[:, 1]
+    first_m, last_m = 0.0, reach_m
+    for condition in range(5):
+        axis = (condition - 1) // 2
+        if condition == 0:
+            g0, g1 = begin[2], step[2]
+        elif condition % 2:
+            g0, g1 = begin[axis], step[axis]
+        else:
+            size = float(width if axis == 0 else height)
+            g0, g1 = size * begin[2] - begin[axis], size * step[2] - step[axis]
+        if g1 > 0:
+            first_m = max(first_m, -g0 / g1)
+        elif g1 < 0:
+            last_m = min(last_m, -g0 / g1)
+        # Along an edge of the image, only the left and the upper one are of it.
+        elif g0 < 0 or (g0 == 0 and condition % 2 == 0):
+            return np.inf, np.inf
+    if first_m < last_m:
+        return first_m, last_m
+    return np.inf, np.inf
 
-    def conditions(h: NDArray[np.float64]) -> NDArray[np.float64]:
-        x, y, z = h.T
-        return np.stack([z, x, width * z - x, y, height * z - y], axis=-1)
 
-    g0, g1 = conditions(begin), conditions(step)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        crossing_m = -g0 / g1
-    first_m = np.where(g1 > 0, crossing_m, 0.0).max(axis=1)
-    last_m = np.where(g1 < 0, crossing_m, reach_m).min(axis=1)
-    # Along an edge of the image, only the left and the upper one are of it.
-    is_outside = (g1 == 0) & np.where([True, False, True, False, True], g0 <= 0, g0 < 0)
-    last_m[is_outside.any(axis=1)] = -1.0
-    return np.clip(first_m, 0.0, reach_m), np.clip(last_m, -1.0, reach_m)
+@compiled
+def _append(begin_m: float, end_m: float, spans_m: NDArray[np.float64], n_spans: int) -> int:
+    """Write a stretch after the others, or prolong the last, and return how many there are."""
+    if n_spans > 0 and spans_m[n_spans - 1, 1] == begin_m:
+        spans_m[n_spans - 1, 1] = end_m
+        return n_spans
+    spans_m[n_spans, 0], spans_m[n_spans, 1] = begin_m, end_m
+    return n_spans + 1
 
 
-def _walk(
-    hull: Hull,
+@compiled
+def _lines_crossed(
+    begin_x: float,
+    begin_z: float,
+    step_x: float,
+    step_z: float,
+    size: int,
+    first_m: float,
+    last_m: float,
+) -> tuple[float, float, float]:
+    """Return the first column (or row) that a stretch may cross, the one after the last, and 1.
+
+    Where the projection goes the other way, these are the last, the one before the first, and -1.
+    """
+    first_z, last_z = begin_z + first_m * step_z, begin_z + last_m * step_z
+    low, high = 0.0, float(size)  # from the camera's centre, any
+    if first_z > 0 and last_z > 0:
+        first_px = (begin_x + first_m * step_x) / first_z
+        last_px = (begin_x + last_m * step_x) / last_z
+        low = max(low, np.floor(min(first_px, last_px)))
+        high = min(high, np.ceil(max(first_px, last_px)))
+    if high < low:
+        return 0.0, 0.0, 1.0
+    # In front of a camera a projection moves to one side all the way.
+    if step_x * begin_z >= begin_x * step_z:
+        return low, high + 1.0, 1.0
+    return high, low - 1.0, -1.0
+
+
+@compiled
+def _next_crossing(
+    begin_x: float,
+    begin_z: float,
+    step_x: float,
+    step_z: float,
+    lines: tuple[float, float, float],
+    after_m: float,
+    last_m: float,
+) -> tuple[float, float]:
+    """Return where a ray next crosses one of the lines, `last_m` if none; and the line after it."""
+    k, stop, by = lines
+    while k != stop:
+        t = (k * begin_z - begin_x) / (step_x - k * step_z)
+        k += by
+        if after_m < t < last_m:
+            return t, k
+    return last_m, k
+
+
+@compiled
+def _walk_camera(
     begin: NDArray[np.float64],
     step: NDArray[np.float64],
-    first_m: NDArray[np.float64],
-    last_m: NDArray[np.float64],
-    reach_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
-    """Return where along a ray what cameras say changes (K + 1,), and what they say (C, K).
+    first_m: float,
+    last_m: float,
+    mask: NDArray[np.uint8],
+    width: int,
+    spans_m: NDArray[np.float64],
+    n_spans: int,
+) -> int:
+    """Write where, in a stretch that a camera sees, it sees object pixels."""
+    height = len(mask) // width
+    x0, y0, z0 = begin
+    x1, y1, z1 = step
+    columns = _lines_crossed(x0, z0, x1, z1, width, first_m, last_m)
+    rows = _lines_crossed(y0, z0, y1, z1, height, first_m, last_m)
+    column_m, next_column = _next_crossing(x0, z0, x1, z1, columns, first_m, last_m)
+    row_m, next_row = _next_crossing(y0, z0, y1, z1, rows, first_m, last_m)
+    at_m = first_m
+    while at_m < last_m:
+        until_m = min(column_m, row_m)
+        middle_m = 0.5 * (at_m + until_m)
+        depth_m = max(z0 + middle_m * z1, _LEAST_DEPTH_M)
+        x, y = (x0 + middle_m * x1) / depth_m, (y0 + middle_m * y1) / depth_m
+        column, row = int(min(max(x, 0.0), width - 1.0)), int(min(max(y, 0.0), height - 1.0))
+        if mask[row * width + column]:
+            n_spans = _append(at_m, until_m, spans_m, n_spans)
+        at_m = until_m
+        if column_m <= at_m:
+            rest = (next_column, columns[1], columns[2])
+            column_m, next_column = _next_crossing(x0, z0, x1, z1, rest, at_m, last_m)
+        if row_m <= at_m:
+            rest = (next_row, rows[1], rows[2])
+            row_m, next_row = _next_crossing(y0, z0, y1, z1, rest, at_m, last_m)
+    return n_spans
 
-    Camera c sees it from ``first_m[c]`` to ``last_m[c]`` and goes through its pixels there.
+
+@compiled
+def _seen_enough(
+    seen_m: NDArray[np.float64], min_cameras: int, reach_m: float, spans_m: NDArray[np.float64]
+) -> int:
+    """Write where at least so many cameras see a ray, and return how many stretches that are."""
+    edges_m = np.zeros(2 * len(seen_m) + 2)
+    edges_m[1] = reach_m
+    for camera in range(len(seen_m)):
+        edges_m[2 * camera + 2] = min(seen_m[camera, 0], reach_m)
+        edges_m[2 * camera + 3] = min(seen_m[camera, 1], reach_m)
+    edges_m.sort()
+    n_spans = ZERO
+    for i in range(len(edges_m) - 1):
+        n_seen = ZERO
+        for camera in range(len(seen_m)):
+            n_seen += seen_m[camera, 0] <= edges_m[i] and edges_m[i + 1] <= seen_m[camera, 1]
+        if edges_m[i] < edges_m[i + 1] and n_seen >= min_cameras:
+            n_spans = _append(edges_m[i], edges_m[i + 1], spans_m, n_spans)
+    return n_spans
+
+
+@compiled
+def _walk(
+    begin: NDArray[np.float64],
+    step: NDArray[np.float64],
+    reach_m: float,
+    sizes: NDArray[np.int64],
+    masks: NDArray[np.uint8],
+    mask_offset: NDArray[np.int64],
+    keep: bool,
+    min_cameras: int,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the stretches (N, 2) of all rays, and where each ray's begin among them (R + 1,).
+
+    The homogeneous projection of a ray's point at t is ``begin + t * step``, (R, C, 3). Camera
+    after camera takes away what it sees background in: what one has taken the next need not walk.
     """
-    n_cameras, sizes_px = len(begin), hull.views.sizes_px
-    is_blind = ~(first_m < last_m)
-    first_m, last_m = np.where(is_blind, 0.0, first_m), np.where(is_blind, 0.0, last_m)
-    begin, step = begin[:, :, None], step[:, :, None]  # (C, 3, 1)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        # In front of a camera a projection moves to one side all the way.
-        ends = begin + np.stack([first_m, last_m], axis=-1)[:, None] * step  # (C, 3, 2)
-        ends_px = ends[:, :2] / ends[:, 2:]  # (C, 2, 2)
-        low, high = np.floor(ends_px.min(axis=2)), np.ceil(ends_px.max(axis=2))  # (C, 2)
-        low, high = np.fmax(low, 0.0), np.fmin(high, sizes_px)  # anywhere, at the camera's centre
-        n_crossings = np.where(is_blind[:, None], 0.0, high - low + 1).max()
-        k = low[:, :, None] + np.arange(max(n_crossings, 0.0))  # (C, 2, N)
-        t = (k * begin[:, 2:] - begin[:, :2]) / (step[:, :2] - k * step[:, 2:])
-    is_between = (t > first_m[:, None, None]) & (t < last_m[:, None, None])
-    t = np.where(is_between, t, last_m[:, None, None]).reshape(n_cameras, -1)
-    edges_m = np.sort(np.column_stack([first_m, t, last_m]), axis=1)  # (C, 2N + 2)
-    middles_m = 0.5 * (edges_m[:, :-1] + edges_m[:, 1:])
-    said = np.full((n_cameras, edges_m.shape[1] + 1), _UNSEEN, np.int8)  # before the first edge, ..
-    said[:, 1:-1] = _at_pixels(hull, begin + middles_m[:, None] * step)
-    said[is_blind] = _UNSEEN
-    changes_m = edges_m[said[:, 1:] != said[:, :-1]]
-    all_m = np.unique(np.concatenate([[0.0, reach_m], changes_m]))
-    middles_m = 0.5 * (all_m[:-1] + all_m[1:])
-    states = [said[c, np.searchsorted(edges_m[c], middles_m)] for c in range(n_cameras)]
-    return all_m, np.stack(states)
+    n_rays, n_cameras = begin.shape[:2]
+    # Each line of pixels is crossed once, and the border of an image twice.
+    most = 2 * n_cameras + 2 + sizes.sum() + 4 * n_cameras
+    left_m, then_m = np.zeros((most, 2)), np.zeros((most, 2))
+    seen_m = np.zeros((n_cameras, 2))
+    told_m = np.zeros((8, 2))
+    offset = np.zeros(n_rays + 1, np.int64)
+    n_told = ZERO
+    for ray in range(n_rays):
+        first_m, last_m = 0.0, reach_m
+        for camera in range(n_cameras):
+            seen_m[camera] = _seen_range(
+                begin[ray, camera],
+                step[ray, camera],
+                sizes[camera, 0],
+                sizes[camera, 1],
+                reach_m,
+            )
+            first_m = max(first_m, seen_m[camera, 0])
+            last_m = min(last_m, seen_m[camera, 1])
+        n_left = ZERO
+        if keep:
+            n_left = _seen_enough(seen_m, min_cameras, reach_m, left_m)
+        elif first_m < last_m:
+            n_left = _append(first_m, last_m, left_m, n_left)
+        for camera in range(n_cameras):
+            n_then = ZERO
+            first_m, last_m = seen_m[camera]
+            width, height = sizes[camera]
+            mask = masks[mask_offset[camera] : mask_offset[camera] + width * height]
+            for i in range(n_left):
+                from_m, to_m = left_m[i]
+                if from_m < first_m:  # it abstains
+                    n_then = _append(from_m, min(to_m, first_m), then_m, n_then)
+                if max(from_m, first_m) < min(to_m, last_m):
+                    n_then = _walk_camera(
+                        begin[ray, camera],
+                        step[ray, camera],
+                        max(from_m, first_m),
+                        min(to_m, last_m),
+                        mask,
+                        width,
+                        then_m,
+                        n_then,
+                    )
+                if max(from_m, last_m) < to_m:
+                    n_then = _append(max(from_m, last_m), to_m, then_m, n_then)
+            left_m, then_m = then_m, left_m
+            n_left = n_then
+        if n_told + n_left > len(told_m):
+            more_m = np.zeros((2 * (n_told + n_left), 2))
+            more_m[:n_told] = told_m[:n_told]
+            told_m = more_m
+        i = ZERO
+        while i < n_left:
+            from_m, to_m = left_m[i]
+            i += 1
+            while i < n_left and left_m[i, 0] - to_m <= ROUNDING_M:
+                to_m = left_m[i, 1]
+                i += 1
+            if to_m - from_m > ROUNDING_M:
+                told_m[n_told, 0], told_m[n_told, 1] = from_m, to_m
+                n_told += 1
+        offset[ray + 1] = n_told
+    return told_m[:n_told], offset
 
 
 def _at_pixels(hull: Hull, projected: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -296,23 +516,6 @@ def _is_inside(hull: Hull, states: NDArray[np.int8]) -> NDArray[np.bool_]:
         return np.asarray((states == _OBJECT).all(axis=0))
     enough = (states != _UNSEEN).sum(axis=0) >= views.min_cameras
     return np.asarray(enough & (states != _BACKGROUND).all(axis=0))
-
-
-def _joined(edges_m: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return stretches (N, 2) from the pieces between edges (K + 1,) that are inside (K,)."""
-    changes = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
-    spans_m = np.column_stack([edges_m[changes == 1], edges_m[changes == -1]])
-    if len(spans_m) == 0:
-        return spans_m
-    is_gap = spans_m[1:, 0] - spans_m[:-1, 1] > ROUNDING_M
-    spans_m = np.column_stack(
-        [
-            spans_m[np.concatenate([[True], is_gap]), 0],
-            spans_m[np.concatenate([is_gap, [True]]), 1],
-        ]
-    )
-    is_told = spans_m[:, 1] - spans_m[:, 0] > ROUNDING_M
-    return np.asarray(spans_m[is_told])
 
 
 def _moment(

@@ -1,0 +1,66 @@
+"""The compiled walk tells what its specification does, whatever the rig and the silhouettes."""
+
+import numpy as np
+from helpers.hulls import EMPTYING_MASK_KINDS, MASK_KINDS, random_masks, random_views
+from helpers.response import camera_center, random_unit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hybridve.hull.query import walk_reference
+from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.query.walk import spans_in_hull, spans_of_rays
+
+Rays = tuple[Hull, NDArray[np.float64], NDArray[np.float64]]
+
+
+@st.composite
+def rays(draw: st.DrawFn) -> Rays:
+    """Rigs of 1 to 6 cameras of unequal image size, and rays: origins (R, 3), unit directions."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    n_cameras = draw(st.integers(1, 6))
+    unseen = draw(st.sampled_from(["carve", "keep"]))
+    views = random_views(rng, n_cameras, unseen, draw(st.integers(1, n_cameras)), 160)
+    kinds = rng.choice(MASK_KINDS * 3 + EMPTYING_MASK_KINDS, n_cameras).tolist()
+    hull = make_hull(views, random_masks(rng, views, kinds))
+    starts = views.origin_world + rng.choice([0.02, 0.3, 3.0], (9, 1)) * rng.normal(size=(9, 3))
+    units = np.stack([random_unit(rng) for _ in range(9)])
+    camera = int(rng.integers(n_cameras))
+    center, matrix = camera_center(views, camera), views.img_from_local[camera]
+    starts[0] = center  # out of a camera, as the ray of a pixel
+    starts[1] = center - 0.7 * units[1]  # from behind it, through its centre
+    starts[2] = center - 0.7 * units[2] + 0.01  # and beside it
+    units[3] = matrix[2, :3]  # along its axis
+    units[4] = -matrix[2, :3]
+    for number, row in ((5, 1), (6, 0)):  # parallel to its rows, and to its columns
+        units[number] = np.cross(matrix[row, :3], matrix[2, :3])
+    units[7] = [0.0, 0.0, 1.0]
+    units /= np.linalg.norm(units, axis=1)[:, None]
+    return hull, starts, units
+
+
+@settings(max_examples=300)
+@given(rays=rays(), reach_m=st.sampled_from([0.05, 4.0, 1e3, 1e7]))
+def test_the_compiled_walk_is_the_specification(rays: Rays, reach_m: float) -> None:
+    hull, starts, units = rays
+    for number, (start, unit) in enumerate(zip(starts, units, strict=True)):
+        found_m = spans_in_hull(hull, start, unit, reach_m)
+        expected_m = walk_reference.spans_in_hull(hull, start, unit, reach_m)
+
+        # Ends are off by the rounding of a pixel, over how fast the projection moves.
+        assert found_m.shape == expected_m.shape, number
+        np.testing.assert_allclose(found_m, expected_m, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=50)
+@given(rays=rays(), seed=st.integers(0, 99))
+def test_a_ray_is_walked_alike_among_others(rays: Rays, seed: int) -> None:
+    hull, starts, units = rays
+    order = np.random.default_rng(seed).permutation(len(starts))[: seed % len(starts)]
+
+    together = spans_of_rays(hull, starts[order], 3.0 * units[order], 8.0)
+
+    assert len(together) == len(order)
+    for spans_m, number in zip(together, order, strict=True):
+        alone_m = spans_in_hull(hull, starts[number], 3.0 * units[number], 8.0)
+        np.testing.assert_array_equal(spans_m, alone_m)
