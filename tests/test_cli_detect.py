@@ -363,7 +363,7 @@ def test_summary_counts_what_the_report_holds(
 def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
     tmp_path: Path, scene: Path, run: Run
 ) -> None:
-    centers = np.tile(CENTERS, (12, 1))  # a part is 64 frames
+    centers = np.tile(CENTERS, (6, 1))  # a part is 64 frames
     session = write_ball_session(tmp_path / "session", centers, n_cameras=2)
     path, whole = tmp_path / "report.h5", tmp_path / "whole.h5"
     arguments = ["detect", str(session), "--scene", str(scene), "--engine", "reference"]

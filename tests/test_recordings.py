@@ -172,6 +172,7 @@ def test_horseman_engines_find_the_same(run: Run, horseman: Path, tmp_path: Path
     for engine, chosen in frames.items():
         path = tmp_path / f"{engine}.h5"
         arguments = ["--scene", scene, "-o", path, "--engine", engine, "--frames", chosen]
+        arguments += ["--clearance-mm", 0, "--no-response", "--no-doubt"]  # no engine's matter
         assert run("detect", horseman, *arguments, "--viewport", 6, "--no-progress") == 0
         report = read_report(path)
         counts[engine] = {name: rows.n_points for name, rows in report.objects.items()}
