@@ -1,8 +1,9 @@
 """Frames per second of the whole chain on the horseman recording: decode, segment, query.
 
 Each round evaluates the same hundred frames, from learning the backgrounds to the last result.
-The robot arm of ``data/horseman`` is subdivided to the number of triangles. The
-aim is 30 frames a second on two cores.
+The robot arm of ``data/horseman`` is subdivided to the number of triangles. The aim is 30 frames a
+second on two cores, of contacts and their certificates. ``bench_parts`` adds what `detect` asks for
+besides, one after the other.
 """
 
 import os
@@ -18,7 +19,9 @@ from hybridve.hull.capture.recording import FrameRange
 from hybridve.hull.capture.rig import calibrate_session
 from hybridve.hull.capture.session import Session, load_session
 from hybridve.hull.contact.detect import Body, make_body
+from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.scene import SceneObject, load_scene
+from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import Chain, EvaluateSettings, evaluate, rig_views
 from hybridve.hull.query.choose import open_engine
 
@@ -73,4 +76,32 @@ def bench_detect_horseman(
         done = benchmark.pedantic(run, rounds=3, warmup_rounds=1)
         benchmark.extra_info["renderer"] = query.renderer
     benchmark.extra_info["triangles"] = sum(len(body.triangles) for body in bodies)
+    benchmark.extra_info["frames_per_second"] = round(done / benchmark.stats["median"], 1)
+
+
+PARTS: dict[str, dict[str, Any]] = {
+    "contacts": {},
+    "clearance": {"clearance_m": 1e-4},
+    "response": {"clearance_m": 1e-4, "response": ResponseSettings()},
+    "doubt": {"clearance_m": 1e-4, "response": ResponseSettings(), "doubt": DoubtSettings()},
+}
+
+
+@pytest.mark.recording
+@pytest.mark.parametrize("parts", list(PARTS))
+def bench_parts(benchmark: Any, horseman: tuple[Session, Rig], parts: str) -> None:
+    """Frames per second with more and more asked of each; 7 links, 3 of which are reached into."""
+    cv2.setNumThreads(1)
+    session, rig = horseman
+    scene = load_scene(PROJECT / "data" / "horseman" / "scene.toml")
+    bodies = [make_body(one, viewport=10) for one in scene.objects]
+    views, lenses = rig_views(session, rig)
+    settings = EvaluateSettings(frames=FrameRange(0, N_FRAMES), **PARTS[parts])
+    chain = Chain(session, rig, scene, settings, lenses, views, bodies, None)
+    with open_engine("native") as query:
+
+        def run() -> int:
+            return sum(1 for _ in evaluate(chain, query))
+
+        done = benchmark.pedantic(run, rounds=3, warmup_rounds=1)
     benchmark.extra_info["frames_per_second"] = round(done / benchmark.stats["median"], 1)
