@@ -326,8 +326,15 @@ def _findings(
     if tools.doubter is not None:
         doubts = tools.doubter.frame(seen.hull)
         findings = [
-            replace(finding, doubt=doubts.doubt(meter, finding.contact, finding.clearance))
-            for finding, meter in zip(findings, tools.meters, strict=True)
+            replace(
+                finding,
+                doubt=doubts.doubt(
+                    meter, finding.contact, finding.clearance, part.required_clearance_m
+                ),
+            )
+            for finding, meter, part in zip(
+                findings, tools.meters, chain.scene.objects, strict=True
+            )
             if finding.clearance is not None
         ]
     watch.lap("doubt")

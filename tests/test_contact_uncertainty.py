@@ -26,6 +26,8 @@ from hybridve.hull.query.silhouettes import Hull, Views, make_hull
 
 FREE = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
 
+CLOSELY = DoubtSettings(near_m=np.inf)
+
 #: A phantom of two balls: the first camera sees it before ball B, the second before ball A.
 BALL_A, BALL_B = np.array([-0.4, 0.1, 0.0]), np.array([0.5, -0.1, 0.0])
 FIRST, SECOND = np.array([-0.6, -3.0, 0.0]), np.array([1.2, -2.8, 0.0])
@@ -52,8 +54,9 @@ def doubt(
     contact: Contact = FREE,
     errors: OutlineErrors | None = None,
 ) -> tuple[Doubt, Clearance]:
+    """Doubt an object, looking closely however far away it is."""
     clearance = meter.measure(hull)
-    frame = Doubter(errors or errors_of(hull.views)).frame(hull)
+    frame = Doubter(errors or errors_of(hull.views), CLOSELY).frame(hull)
     return frame.doubt(meter, contact, clearance), clearance
 
 
@@ -228,6 +231,47 @@ def test_a_clearance_that_one_camera_alone_keeps_hinges_on_it() -> None:
     assert clearance.lower_m > 0.3
     assert (found.survives, found.hinges_on) == (False, ("cam2",))
     assert (beyond.survives, beyond.hinges_on) == (True, ())
+
+
+@pytest.mark.parametrize(
+    ("near_m", "required_m", "is_close"),
+    [(0.1, 0.0, False), (0.5, 0.0, True), (0.1, 0.2, True), (0.1, 0.1, False), (0.0, 0.0, False)],
+)
+def test_what_is_far_away_is_not_looked_at_closely_and_nothing_is_claimed_of_it(
+    near_m: float, required_m: float, is_close: bool
+) -> None:
+    hull = ball_hull(ring_views(4), np.zeros(3), 0.2)
+    meter = box_meter(np.array([0.0, 0.0, 0.6]), 0.05)
+    clearance = meter.measure(hull)
+    assert 0.2 < clearance.lower_m < 0.4
+    closely, _ = doubt(hull, meter)
+
+    frame = Doubter(errors_of(hull.views), DoubtSettings(near_m=near_m)).frame(hull)
+    found = frame.doubt(meter, FREE, clearance, required_m)
+
+    np.testing.assert_array_equal(found.mm_per_px, closely.mm_per_px)
+    same = (found.std_m, found.at_least_m, found.n_seeing)
+    assert same == (closely.std_m, closely.at_least_m, closely.n_seeing)
+    close = (found.survives, found.hinges_on, found.component)
+    if is_close:
+        assert close == (closely.survives, closely.hinges_on, closely.component)
+        assert found.real_upper_m == closely.real_upper_m >= clearance.lower_m
+    else:
+        assert close == (None, (), "")
+        assert np.isnan(found.real_upper_m)
+
+
+def test_what_clashes_is_always_looked_at_closely() -> None:
+    hull = ball_hull(ring_views(4), np.zeros(3), 0.1)
+    settings = DoubtSettings(near_m=0.0)
+    for half_m, contact in ((0.05, touching(np.zeros(3))), (0.3, FREE)):  # touched; around it
+        meter = box_meter(np.zeros(3), half_m)
+
+        frame = Doubter(errors_of(hull.views), settings).frame(hull)
+        found = frame.doubt(meter, contact, meter.measure(hull))
+
+        assert (found.survives, found.component) == (True, "real")
+        assert np.isfinite(found.real_upper_m)
 
 
 def test_a_contact_with_a_phantom_is_unsure_and_one_with_a_ball_is_real() -> None:

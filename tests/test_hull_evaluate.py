@@ -68,7 +68,7 @@ def chain_of(session: Path, scene: Path, **changes: Any) -> Chain:
         clearance_m=1e-4,
         response=ResponseSettings(),
         backtrack=True,
-        doubt=DoubtSettings(),
+        doubt=DoubtSettings(near_m=10.0),
     )
     return make_chain(load_session(session), load_scene(scene), replace(settings, **changes))
 

@@ -83,9 +83,8 @@ def a_finding(draw: st.DrawFn, rng: np.random.Generator) -> Finding:
         "",
     )
     hinges_on = draw(st.sampled_from([(), ("left",), ("left", "top")]))
-    doubt = Doubt(
-        number(), number(), number(), vector(), False, 2, not hinges_on, hinges_on, "unsure"
-    )
+    survives = draw(st.sampled_from([not hinges_on, None]))
+    doubt = Doubt(number(), number(), number(), vector(), False, 2, survives, hinges_on, "unsure")
     return Finding(
         a_contact(draw, rng),
         clearance if "clearance" in there else None,
@@ -202,7 +201,7 @@ def expected_columns(finding: Finding) -> dict[str, Any]:
             "real_clearance_at_most_m": doubt.real_upper_m,
             "m_per_px": doubt.mm_per_px,
             "n_seeing": doubt.n_seeing,
-            "survives": doubt.survives,
+            "survives": "" if doubt.survives is None else "yes" if doubt.survives else "no",
             "hinges_on": ", ".join(doubt.hinges_on),
             "component": doubt.component,
         }

@@ -92,6 +92,9 @@ _MOST_RESIDUAL = 0.35
 #: Nearer than this there is no direction from the hull to the object.
 _NO_DIRECTION_M = 1e-7
 
+#: An object nearer than so many times the clearance that it requires is looked at closely.
+_NEAR_REQUIRED = 2.0
+
 #: Collision points that are asked whether they stand without a camera.
 _MOST_POINTS = 4096
 
@@ -110,11 +113,15 @@ class DoubtSettings:
         Standard deviation of a projection along one axis, for cameras whose rig does not tell.
     cell_m : float
         Volumes that are nearer to each other than some two of these may be told as one.
+    near_m : float
+        Objects that are farther from the hull than this, and than twice the clearance that they
+        require, have no `real_upper_m`, `survives` and `component`: that takes most of the time.
     """
 
     segmentation_px: float = 1.5
     calibration_px: float = 0.5
     cell_m: float = CELL_M
+    near_m: float = 0.10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,7 +211,8 @@ class Doubt:
         Estimate: what the clearance is at least, at 95 %; not below 0. NaN with `std_m`.
     real_upper_m : float
         Bound, given right silhouettes: the real thing is not farther away than this; 0 if it
-        certainly reaches into a closed object; inf where no ray tells.
+        certainly reaches into a closed object; inf where no ray tells; NaN where the object is too
+        far away to be looked at closely (`DoubtSettings.near_m`).
     mm_per_px : (C,) float64
         Estimate: by how many metres the clearance falls when a camera's outline moves outward by
         one pixel.
@@ -213,15 +221,18 @@ class Doubt:
         the outlines' directions do not explain the direction to the object.
     n_seeing : int
         Exact: how many cameras see the contact, or the hull's nearest point.
-    survives : bool
-        Exact: whether the verdict, touched or not, stands with any one camera left out.
+    survives : bool or None
+        Exact: whether the verdict, touched or not, stands with any one camera left out; None where
+        the object is too far away to be looked at closely: it may stand, or not.
     hinges_on : tuple of str
-        Exact: the cameras without which it does not. A contact stands if one of its known points
-        does, a free object if it is certainly free: not within the meter's tolerance of the hull.
+        Exact: the cameras without which it does not, none where that was not looked at. A contact
+        stands if one of its known points does, a free object if it is certainly free: not within
+        the meter's tolerance of the hull.
     component : "real", "unsure" or ""
         Bound, given right silhouettes: "real" if the volume that touches or is nearest is proved to
         hold something real; "unsure" if each pixel it explains is explained by another volume, too,
-        as of a phantom; "" where there is no volume, or it is too far away to be looked at.
+        as of a phantom; "" where there is no volume, where it is farther away than cells are
+        looked for, or the object is too far away to be looked at closely.
     """
 
     std_m: float
@@ -230,7 +241,7 @@ class Doubt:
     mm_per_px: NDArray[np.float64]
     is_remeasured: bool
     n_seeing: int
-    survives: bool
+    survives: bool | None
     hinges_on: tuple[str, ...]
     component: Literal["real", "unsure", ""]
 
@@ -283,7 +294,13 @@ class FrameDoubts:
         """The hulls without one camera each."""
         return [without_camera(self.hull, camera) for camera in range(len(self.hull.views))]
 
-    def doubt(self, meter: ClearanceMeter, contact: Contact, clearance: Clearance) -> Doubt:
+    def doubt(
+        self,
+        meter: ClearanceMeter,
+        contact: Contact,
+        clearance: Clearance,
+        required_m: float = 0.0,
+    ) -> Doubt:
         """Return how far an object's contact and clearance can be trusted.
 
         Parameters
@@ -294,27 +311,39 @@ class FrameDoubts:
             Of the object in this frame.
         clearance : Clearance
             Of the object in this frame.
+        required_m : float
+            The clearance that the object requires.
         """
         sensitivity_m, is_remeasured = self.sensitivity(meter, clearance)
         std_m = float(np.sqrt(((sensitivity_m * self.errors.sigma_px) ** 2).sum()))
-        points_world = _touching_points(contact)
-        if len(points_world):
-            hinges_on = self._contact_hinges_on(points_world)
-        elif clearance.upper_m > 0:
-            hinges_on = self._freedom_hinges_on(meter)
-        else:  # swallowed by a closed object, which no sample on its surface tells
-            hinges_on = self._contact_hinges_on(clearance.on_hull_world[None])
+        touching_world = _touching_points(contact)
+        points_world = touching_world
         if len(points_world) == 0 and np.isfinite(clearance.on_hull_world).all():
             points_world = clearance.on_hull_world[None]
-        return Doubt(
+        found = Doubt(
             std_m=std_m,
             at_least_m=max(0.0, clearance.lower_m - ONE_SIDED_95 * std_m)
             if np.isfinite(std_m)
             else np.nan,
-            real_upper_m=real_upper(self.hull, self.grown, meter, clearance),
+            real_upper_m=np.nan,
             mm_per_px=sensitivity_m,
             is_remeasured=is_remeasured,
             n_seeing=_count_seeing(self.hull.views, points_world[0]) if len(points_world) else 0,
+            survives=None,
+            hinges_on=(),
+            component="",
+        )
+        is_clash = len(touching_world) > 0 or clearance.upper_m <= 0
+        near_m = max(self.settings.near_m, _NEAR_REQUIRED * required_m)
+        if not is_clash and clearance.lower_m >= near_m:
+            return found
+        if is_clash:  # swallowed by a closed object, no sample on its surface tells
+            hinges_on = self._contact_hinges_on(points_world)
+        else:
+            hinges_on = self._freedom_hinges_on(meter)
+        return replace(
+            found,
+            real_upper_m=real_upper(self.hull, self.grown, meter, clearance),
             survives=not hinges_on,
             hinges_on=hinges_on,
             component=self._component(points_world),
@@ -342,13 +371,24 @@ class FrameDoubts:
                 sensitivity_m[camera] = max(0.0, clearance.signed_m[1] - then.signed_m[1])
         return sensitivity_m, True
 
+    @cached_property
+    def _both(self) -> Hull:
+        """The hull, with the images of the grown one behind its own."""
+        return replace(
+            self.hull,
+            masks_flat=np.concatenate([self.hull.masks_flat, self.grown.masks_flat]),
+            integrals_flat=np.concatenate([self.hull.integrals_flat, self.grown.integrals_flat]),
+        )
+
     def _grown_in(self, camera: int) -> Hull:
-        """Return the hull with one camera's silhouette grown by a pixel."""
-        masks_flat, integrals_flat = self.hull.masks_flat.copy(), self.hull.integrals_flat.copy()
-        changed = replace(self.hull, masks_flat=masks_flat, integrals_flat=integrals_flat)
-        changed.mask(camera)[:] = self.grown.mask(camera)
-        changed.integral(camera)[:] = self.grown.integral(camera)
-        return changed
+        """Return the hull with one camera's silhouette grown by a pixel; images are shared."""
+        mask_offset, integral_offset = (
+            self.hull.mask_offset.copy(),
+            self.hull.integral_offset.copy(),
+        )
+        mask_offset[camera] = len(self.hull.masks_flat) + self.grown.mask_offset[camera]
+        integral_offset[camera] = len(self.hull.integrals_flat) + self.grown.integral_offset[camera]
+        return replace(self._both, mask_offset=mask_offset, integral_offset=integral_offset)
 
     def _contact_hinges_on(self, points_world: NDArray[np.float64]) -> tuple[str, ...]:
         """Return the cameras without which no known point of a contact is left."""

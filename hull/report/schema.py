@@ -479,7 +479,8 @@ _DOUBT: "tuple[Column[Doubt], ...]" = (
         "real_clearance_at_most_m",
         "m",
         "bound",
-        "the real thing is not farther away than this, given right silhouettes; inf if unknown",
+        "the real thing is not farther away than this, given right silhouettes; inf if unknown, "
+        "NaN of objects too far away to be looked at closely",
         np.float64,
         lambda doubt: doubt.real_upper_m,
     ),
@@ -504,9 +505,10 @@ _DOUBT: "tuple[Column[Doubt], ...]" = (
         "survives",
         "1",
         "exact",
-        "whether the verdict, touched or not, stands with any one camera left out",
-        np.bool_,
-        lambda doubt: doubt.survives,
+        "yes or no: whether the verdict, touched or not, stands with any one camera left out; "
+        "empty of objects too far away to be looked at closely",
+        str,
+        lambda doubt: {True: "yes", False: "no", None: ""}[doubt.survives],
     ),
     Column(
         "hinges_on",
@@ -521,7 +523,8 @@ _DOUBT: "tuple[Column[Doubt], ...]" = (
         "1",
         "bound",
         "the volume of the hull that touches or is nearest; real: it holds something real, given "
-        "right silhouettes; unsure: other volumes explain all that it does, as of a phantom",
+        "right silhouettes; unsure: other volumes explain all that it does, as of a phantom; empty "
+        "of objects too far away to be looked at closely",
         str,
         lambda doubt: doubt.component,
     ),

@@ -208,7 +208,7 @@ def _about_recovery(rows: ObjectColumns, report: Report) -> dict[str, Any]:
 def _about_doubt(rows: ObjectColumns) -> dict[str, Any]:
     if "survives" not in rows:
         return {"frames_hinging": None, "hinges_on": [], "frames_unsure": None}
-    hinges = rows.clashes & ~rows["survives"]
+    hinges = rows.clashes & (rows["survives"] == "no")
     cameras = {name for text in rows["hinges_on"][hinges] for name in text.split(", ") if name}
     return {
         "frames_hinging": int(hinges.sum()),

@@ -113,7 +113,9 @@ def test_whatever_the_silhouettes_a_doubt_agrees_with_itself(
     hull = make_hull(views, random_masks(rng, views, kinds))
     clearance = meter().measure(hull)
     contact = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
-    doubter = Doubter(outline_errors(views.names, {}, [0.0] * n_cameras), DoubtSettings(cell_m=0.2))
+    doubter = Doubter(
+        outline_errors(views.names, {}, [0.0] * n_cameras), DoubtSettings(cell_m=0.2, near_m=np.inf)
+    )
 
     found = doubter.frame(hull).doubt(meter(), contact, clearance)
 
