@@ -21,6 +21,7 @@ from hybridve.hull.contact.components import (
     cover,
     grown,
     is_real,
+    is_real_at,
     pixel_rays,
 )
 from hybridve.hull.evaluate import rig_views
@@ -209,6 +210,28 @@ def test_what_is_called_real_holds_a_part_of_a_real_ball(
     assert NOWHERE not in held, "all cameras see all of the balls"
     assert set(np.flatnonzero(real)) <= set(held.tolist())
     assert n_balls > 1 or real == [True]
+    # The quick proof claims no more, and tells a ball that stands alone.
+    larger = grown(hull)
+    for volume in range(len(volumes)):
+        cells = np.argwhere(volumes.number == volume + 1)[::7] + volumes.first
+        middles = (cells + 0.5) * volumes.cell_m + hull.views.origin_world
+        if volume not in held:
+            assert not any(is_real_at(hull, larger, middle) for middle in middles)
+    assert n_balls > 1 or is_real_at(hull, larger, balls[0][0])
+
+
+def test_the_quick_proof_is_of_what_the_point_is_connected_with() -> None:
+    # Side by side for the first camera; for the second, the one hides the other.
+    one, other = np.array([0.0, -0.3, 0.0]), np.array([0.0, 0.3, 0.0])
+    views = views_from([np.array([3.0, 0.0, 0.0]), np.array([0.0, 3.0, 0.0])], 320, 240, 240.0)
+    hull = hull_of_balls(views, [(one, 0.1), (other, 0.1)])
+    larger = grown(hull)
+
+    assert is_real_at(hull, larger, one)
+    assert is_real_at(hull, larger, other)
+    assert not is_real_at(hull, larger, np.zeros(3)), "between the two: background"
+    alone = make_hull(views_from([np.array([3.0, 0.0, 0.0])]), [np.ones((480, 640), np.uint8)])
+    assert not is_real_at(alone, alone, np.array([4.0, 0.0, 0.0])), "behind the camera"
 
 
 def test_cells_have_a_size() -> None:

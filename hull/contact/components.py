@@ -38,9 +38,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from hybridve.hull.jit import ZERO, compiled, inlined
-from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
-from hybridve.hull.query.walk import spans_in_hull
+from hybridve.hull.query.walk import contains_few, spans_in_hull
 
 #: By how much silhouettes are grown: a thing's outline is within a pixel of its sampled one.
 GROWN_PX = 1
@@ -458,6 +457,39 @@ def _blocks(
     )
 
 
+def is_real_at(hull: Hull, grown_hull: Hull, point_world: NDArray[np.float64]) -> bool:
+    """Tell whether right silhouettes prove that what a point is part of holds something real.
+
+    Few of the proofs of `is_real`, but without volumes: the ray of a pixel that the point projects
+    to must be in the hull in one stretch, and the way from the point to the ray in the hull, too.
+
+    Parameters
+    ----------
+    hull, grown_hull : Hull
+        Of one frame; see `grown`.
+    point_world : (3,) float64
+        A point, metres.
+    """
+    for camera in range(len(hull.views)):
+        pixels = _object_pixels(hull, camera, point_world[None])
+        if len(pixels) == 0:
+            continue
+        row, column = pixels[0].tolist()
+        origin_world, (direction,) = pixel_rays(hull.views, camera, [(column, row)])
+        spans_m = spans_in_hull(grown_hull, origin_world, direction, FAR_M)
+        if len(spans_m) != 1:
+            continue
+        along_m = np.clip((point_world - origin_world) @ direction, *spans_m[0])
+        way_world = origin_world + along_m * direction - point_world
+        length_m = float(np.linalg.norm(way_world))
+        if length_m == 0.0:
+            return True
+        way_m = spans_in_hull(grown_hull, point_world, way_world, length_m)
+        if np.array_equal(way_m, [[0.0, length_m]]):
+            return True
+    return False
+
+
 def is_real(hull: Hull, volumes: Volumes, coverage: Coverage, volume: int) -> bool:
     """Tell whether right silhouettes prove that a volume holds something real.
 
@@ -490,7 +522,7 @@ def _points_within(volumes: Volumes, volume: int) -> NDArray[np.float64]:
     inner = (np.indices((_CELL_POINTS,) * 3).reshape(3, -1).T + 0.5) / _CELL_POINTS
     points_local = (cells[:, None] + inner).reshape(-1, 3) * volumes.cell_m
     points_world = np.asarray(points_local + volumes.hull.views.origin_world)
-    return points_world[contains_points(volumes.hull, points_world)]
+    return points_world[contains_few(volumes.hull, points_world)]
 
 
 def _object_pixels(hull: Hull, camera: int, points_world: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -501,9 +533,10 @@ def _object_pixels(hull: Hull, camera: int, points_world: NDArray[np.float64]) -
     h = h[h[:, 2] > 0]
     with np.errstate(over="ignore"):
         pixels = np.clip(h[:, 1::-1] / h[:, 2:], -1, mask.shape)
-    pixels = np.unique(np.floor(pixels).astype(np.int64), axis=0)
-    pixels = pixels[((pixels >= 0) & (pixels < mask.shape)).all(axis=1)]
-    return np.asarray(pixels[mask[tuple(pixels.T)] > 0])
+    pixels = np.floor(pixels).astype(np.int64)
+    row, column = pixels[((pixels >= 0) & (pixels < mask.shape)).all(axis=1)].T
+    at = np.unique(row * mask.shape[1] + column)
+    return np.stack(np.divmod(at[mask.ravel()[at] > 0], mask.shape[1]), axis=1)
 
 
 def _evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:

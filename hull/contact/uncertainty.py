@@ -72,6 +72,7 @@ from hybridve.hull.contact.components import (
     cover,
     grown,
     is_real,
+    is_real_at,
 )
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.query.reference import contains_points
@@ -97,6 +98,10 @@ _NEAR_REQUIRED = 2.0
 
 #: Collision points that are asked whether they stand without a camera.
 _MOST_POINTS = 4096
+
+
+#: So many of a contact's points are asked for a proof that it is real before volumes are made.
+_QUICK_POINTS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -416,6 +421,9 @@ class FrameDoubts:
 
     def _component(self, points_world: NDArray[np.float64]) -> Literal["real", "unsure", ""]:
         """Return whether one of the volumes that hold points is proved to hold something real."""
+        for point_world in points_world[:_QUICK_POINTS]:
+            if is_real_at(self.hull, self.grown, point_world):
+                return "real"
         held_by = np.unique(self.volumes.at(points_world))
         held_by = held_by[held_by != NOWHERE]
         if len(held_by) == 0:
@@ -553,8 +561,14 @@ def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64
     height, width = mask.shape
     if not (0 <= x < width and 0 <= y < height):
         return False
-    reach = np.arange(-int(_NEAR_PX) - 1, int(_NEAR_PX) + 2)
-    columns, rows = int(x) + reach, int(y) + reach
+    most = int(_NEAR_PX) + 1
+    column, row = int(x), int(y)
+    if most <= column < width - most and most <= row < height - most:
+        around = mask[row - most : row + most + 1, column - most : column + most + 1]
+        if around.all():  # most often
+            return False
+    reach = np.arange(-most, most + 1)
+    columns, rows = column + reach, row + reach
     # To the nearest point of each pixel's square.
     away_x = np.maximum(np.maximum(columns - x, x - columns - 1), 0.0)
     away_y = np.maximum(np.maximum(rows - y, y - rows - 1), 0.0)
