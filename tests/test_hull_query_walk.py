@@ -100,6 +100,21 @@ def test_a_reach_is_a_length(reach_m: float) -> None:
         spans_in_hull(small_hull([ROW]), np.zeros(3), X, reach_m)
 
 
+@pytest.mark.parametrize("far", [np.nan, np.inf])
+def test_an_origin_is_a_point(far: float) -> None:
+    with pytest.raises(ValueError, match="origin"):
+        spans_in_hull(small_hull([ROW]), np.array([0.0, far, 1.0]), X, 1.0)
+
+
+@pytest.mark.parametrize("unseen", ["carve", "keep"])
+def test_among_the_largest_numbers_a_ray_still_ends_within_its_reach(unseen: Unseen) -> None:
+    hull, reach_m = small_hull([ROW, [[1, 1, 0]]], unseen), 1e308
+    for origin in ([1e308, 1e308, 1e308], [-1e308, 0.0, 1e308], [0.0, 0.0, -1e308]):
+        ends_m = spans_in_hull(hull, np.array(origin), np.array([1.0, 1.0, -1.0]), reach_m).ravel()
+        assert ((ends_m >= 0) & (ends_m <= reach_m)).all()
+        assert (np.diff(ends_m) > 0).all()
+
+
 @pytest.mark.parametrize("direction", [0 * X, np.nan * X, np.array([np.inf, 0, 0])])
 def test_a_direction_has_a_length(direction: NDArray[np.float64]) -> None:
     with pytest.raises(ValueError, match="direction"):

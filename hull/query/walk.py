@@ -70,7 +70,8 @@ def spans_in_hull(
     Raises
     ------
     ValueError
-        If the direction has no length, or the reach is not a positive length.
+        If the origin is not finite, the direction has no length, or the reach is not a positive
+        length.
     """
     return spans_of_rays(hull, origin_world[None], direction[None], reach_m)[0]
 
@@ -102,10 +103,13 @@ def spans_of_rays(
     Raises
     ------
     ValueError
-        If a direction has no length, or the reach is not a positive length.
+        If an origin is not finite, a direction has no length, or the reach is not a positive
+        length.
     """
     if not 0 < reach_m < np.inf:
         raise ValueError(f"reach_m is {reach_m}, expected a positive length")
+    if not np.isfinite(origins_world).all():
+        raise ValueError(f"origins are {origins_world}, expected finite points")
     views = hull.views
     units = np.zeros((len(directions), 3))
     for unit, direction in zip(units, directions, strict=True):
@@ -369,7 +373,9 @@ def _walk_camera(
         middle_m = 0.5 * (at_m + until_m)
         depth_m = max(z0 + middle_m * z1, _LEAST_DEPTH_M)
         x, y = (x0 + middle_m * x1) / depth_m, (y0 + middle_m * y1) / depth_m
-        column, row = int(min(max(x, 0.0), width - 1.0)), int(min(max(y, 0.0), height - 1.0))
+        # Whatever rounding, or an overflow, made of them: a pixel of the image.
+        column = int(min(x, width - 1.0)) if x > 0 else 0
+        row = int(min(y, height - 1.0)) if y > 0 else 0
         if mask[row * width + column]:
             n_spans = _append(at_m, until_m, spans_m, n_spans)
         at_m = until_m
