@@ -185,6 +185,50 @@ def bench_horseman(benchmark: Any, horseman: list[Hull], part: int) -> None:
     )
 
 
+@pytest.mark.recording
+@pytest.mark.parametrize("library", ["libigl", "Open3D"])
+def bench_distances(benchmark: Any, recordings: Path, library: str) -> None:
+    """1000 distances to each part of a printer, sized to 0.4 m: time, and how far off the nearest.
+
+    Of two triangles that a library may name the nearer one is right, so that what is larger than
+    libigl's, in double precision, is wrong by at least that.
+    """
+    import open3d
+
+    from hybridve.hull.contact.distance import SurfaceDistance
+    from hybridve.hull.contact.mesh import read_cad
+
+    rng = np.random.default_rng(0)
+    asked, off_mm = [], 0.0
+    for path in sorted((recordings / "meshes" / "prusa").glob("*.stl")):
+        mesh = read_cad(path).parts[0]
+        vertices = mesh.vertices - (mesh.vertices.max(axis=0) + mesh.vertices.min(axis=0)) / 2
+        vertices *= 0.2 / np.abs(vertices).max()
+        points = vertices[mesh.faces[rng.integers(len(mesh.faces), size=1000)]].mean(axis=1)
+        points += 10.0 ** rng.uniform(-4, -1, (1000, 1)) * rng.normal(size=(1000, 3))
+        points = points.astype(np.float32).astype(np.float64)  # the same for both
+        exact = SurfaceDistance(vertices, mesh.faces, is_closed=False)
+        single = open3d.t.geometry.RaycastingScene(nthreads=1)
+        single.add_triangles(
+            open3d.core.Tensor.from_numpy(vertices.astype(np.float32)),
+            open3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
+        )
+        tensor = open3d.core.Tensor.from_numpy(points.astype(np.float32))
+        found = single.compute_distance(tensor, nthreads=1).numpy()
+        off_mm = max(off_mm, 1e3 * float((found - exact.closest(points)[0]).max()))
+        asked.append((exact, single, points, tensor))
+
+    def measure() -> None:
+        for exact, single, points, tensor in asked:
+            if library == "libigl":
+                exact.closest(points)
+            else:
+                single.compute_distance(tensor, nthreads=1)
+
+    benchmark.pedantic(measure, rounds=5, warmup_rounds=1)
+    benchmark.extra_info.update(parts=len(asked), open3d_too_large_mm=round(off_mm, 4))
+
+
 def subdivided(
     vertices: NDArray[np.float64], faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
