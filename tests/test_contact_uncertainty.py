@@ -94,7 +94,7 @@ def test_clearance_moves_with_the_outlines_as_the_cones_do(
 
     pixel_m = 3.5 / 1400.0
     assert clearance.upper_m == pytest.approx(0.3, abs=1.5 * pixel_m)
-    assert found.mm_per_px.sum() == pytest.approx(moved_m[-1] / sigma_px, rel=0.15)
+    assert found.m_per_px.sum() == pytest.approx(moved_m[-1] / sigma_px, rel=0.15)
     # Where cones all but meet, it is open which of them ends the hull; the fewest vary most.
     rounding = np.hypot(1.0, errors.quantisation_px / sigma_px)
     assert 0.85 < found.std_m / rounding / np.linalg.norm(moved_m[:-1]) < 1.45
@@ -217,7 +217,7 @@ def test_where_outlines_explain_nothing_the_clearance_is_measured_again() -> Non
     bigger = masks[0].copy()
     bigger[239:243, 359:363] = 1
     moved = meter.measure(make_hull(views, [bigger, *masks[1:]]))
-    assert found.mm_per_px[0] == pytest.approx(clearance.upper_m - moved.upper_m, abs=1e-12)
+    assert found.m_per_px[0] == pytest.approx(clearance.upper_m - moved.upper_m, abs=1e-12)
 
 
 def test_a_clearance_that_one_camera_alone_keeps_hinges_on_it() -> None:
@@ -249,7 +249,7 @@ def test_what_is_far_away_is_not_looked_at_closely_and_nothing_is_claimed_of_it(
     frame = Doubter(errors_of(hull.views), DoubtSettings(near_m=near_m)).frame(hull)
     found = frame.doubt(meter, FREE, clearance, required_m)
 
-    np.testing.assert_array_equal(found.mm_per_px, closely.mm_per_px)
+    np.testing.assert_array_equal(found.m_per_px, closely.m_per_px)
     same = (found.std_m, found.at_least_m, found.n_seeing)
     assert same == (closely.std_m, closely.at_least_m, closely.n_seeing)
     close = (found.survives, found.hinges_on, found.component)

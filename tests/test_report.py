@@ -192,6 +192,7 @@ def expected_columns(finding: Finding) -> dict[str, Any]:
             "cp_hull_paper_m": response.cp_hull_paper_world,
             "n_hull_paper": response.n_hull_paper,
             "d_rec_paper_m": response.d_rec_paper_m,
+            "d_rec_difference_m": response.d_rec_paper_m - response.d_rec_m,
             "response_status_paper": response.status_paper,
         }
     if doubt is not None:
@@ -199,7 +200,7 @@ def expected_columns(finding: Finding) -> dict[str, Any]:
             "clearance_std_m": doubt.std_m,
             "clearance_at_least_m": doubt.at_least_m,
             "real_clearance_at_most_m": doubt.real_upper_m,
-            "m_per_px": doubt.mm_per_px,
+            "m_per_px": doubt.m_per_px,
             "n_seeing": doubt.n_seeing,
             "survives": "" if doubt.survives is None else "yes" if doubt.survives else "no",
             "hinges_on": ", ".join(doubt.hinges_on),

@@ -43,7 +43,7 @@ the signed clearance falls as the depth grows.
 What moves an outline
 ---------------------
 Per camera, in pixels, taken to be independent from camera to camera: `OutlineErrors`. Independent,
-they add up in squares: ``std_m ** 2 = sum (mm_per_px[k] * sigma_px[k]) ** 2``. The lower bound less
+they add up in squares: ``std_m ** 2 = sum (m_per_px[k] * sigma_px[k]) ** 2``. The lower bound less
 1.645 of these is what the clearance is at least, at 95 % on one side.
 
 What is not in it: a silhouette that is wrong by more than its outline (a hand cut off, a chair that
@@ -218,7 +218,7 @@ class Doubt:
         Bound, given right silhouettes: the real thing is not farther away than this; 0 if it
         certainly reaches into a closed object; inf where no ray tells; NaN where the object is too
         far away to be looked at closely (`DoubtSettings.near_m`).
-    mm_per_px : (C,) float64
+    m_per_px : (C,) float64
         Estimate: by how many metres the clearance falls when a camera's outline moves outward by
         one pixel.
     is_remeasured : bool
@@ -243,7 +243,7 @@ class Doubt:
     std_m: float
     at_least_m: float
     real_upper_m: float
-    mm_per_px: NDArray[np.float64]
+    m_per_px: NDArray[np.float64]
     is_remeasured: bool
     n_seeing: int
     survives: bool | None
@@ -331,7 +331,7 @@ class FrameDoubts:
             if np.isfinite(std_m)
             else np.nan,
             real_upper_m=np.nan,
-            mm_per_px=sensitivity_m,
+            m_per_px=sensitivity_m,
             is_remeasured=is_remeasured,
             n_seeing=_count_seeing(self.hull.views, points_world[0]) if len(points_world) else 0,
             survives=None,

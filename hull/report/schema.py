@@ -439,6 +439,14 @@ _RESPONSE: "tuple[Column[Response], ...]" = (
         lambda response: response.d_rec_paper_m,
     ),
     Column(
+        "d_rec_difference_m",
+        "m",
+        "sampled",
+        "d_rec_paper_m less d_rec_m",
+        np.float64,
+        lambda response: response.difference_m,
+    ),
+    Column(
         "n_hull_paper",
         "1",
         "sampled",
@@ -490,7 +498,7 @@ _DOUBT: "tuple[Column[Doubt], ...]" = (
         "estimate",
         "by how much the clearance falls when a camera's outline moves outward by a pixel",
         np.float64,
-        lambda doubt: doubt.mm_per_px,
+        lambda doubt: doubt.m_per_px,
         shape=("C",),
     ),
     Column(

@@ -119,7 +119,7 @@ def test_whatever_the_silhouettes_a_doubt_agrees_with_itself(
 
     found = doubter.frame(hull).doubt(meter(), contact, clearance)
 
-    assert (found.mm_per_px >= 0).all() or np.isnan(found.mm_per_px).all()
+    assert (found.m_per_px >= 0).all() or np.isnan(found.m_per_px).all()
     assert not found.at_least_m > clearance.lower_m
     assert found.real_upper_m >= clearance.lower_m
     assert found.survives == (not found.hinges_on)
