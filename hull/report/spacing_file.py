@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import ReportError
+from hybridve.hull.report.result_file import reading, writing
 
 FORMAT = "hybridve-spacing"
 VERSION = 1
@@ -221,15 +221,8 @@ def write_spacing(path: Path, spacing: Spacing) -> None:
     ReportError
         If it cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with h5py.File(partial, "w") as file:
-            _write(file, spacing)
-        partial.replace(path)
-    except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with writing(path) as file:
+        _write(file, spacing)
 
 
 def read_spacing(path: Path) -> Spacing:
@@ -240,23 +233,8 @@ def read_spacing(path: Path) -> Spacing:
     ReportError
         If there is no such file, it is not a spacing, of an unknown version, or damaged.
     """
-    if not path.is_file():
-        raise ReportError(f"{path}: there is no such spacing")
-    try:
-        with h5py.File(path, "r") as file:
-            found = file.attrs.get("format", "an unknown format")
-            if found != FORMAT:
-                raise ReportError(f"{path}: holds {found}, expected {FORMAT}")
-            version = int(file.attrs["version"])
-            if version != VERSION:
-                raise ReportError(
-                    f"{path}: spacing version {version}, this hybridve reads {VERSION}; "
-                    "use the version that wrote it"
-                )
-            return _read(file)
-    except (OSError, KeyError, ValueError) as error:
-        text = str(error).splitlines()[0]
-        raise ReportError(f"{path}: not a readable spacing, or damaged: {text}") from error
+    with reading(path, "spacing", VERSION) as file:
+        return _read(file)
 
 
 def _write(file: h5py.File, spacing: Spacing) -> None:

@@ -23,7 +23,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import ReportError
+from hybridve.hull.report.result_file import reading, writing
 
 FORMAT = "hybridve-sweep"
 VERSION = 1
@@ -347,15 +347,8 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
     ReportError
         If it cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with h5py.File(partial, "w") as file:
-            _write(file, sweep)
-        partial.replace(path)
-    except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with writing(path) as file:
+        _write(file, sweep)
 
 
 def read_sweep(path: Path) -> Sweep:
@@ -366,23 +359,8 @@ def read_sweep(path: Path) -> Sweep:
     ReportError
         If there is no such file, it is not a sweep, of an unknown version, or damaged.
     """
-    if not path.is_file():
-        raise ReportError(f"{path}: there is no such sweep")
-    try:
-        with h5py.File(path, "r") as file:
-            found = file.attrs.get("format", "an unknown format")
-            if found != FORMAT:
-                raise ReportError(f"{path}: holds {found}, expected {FORMAT}")
-            version = int(file.attrs["version"])
-            if version != VERSION:
-                raise ReportError(
-                    f"{path}: sweep version {version}, this hybridve reads {VERSION}; "
-                    "use the version that wrote it"
-                )
-            return _read(file)
-    except (OSError, KeyError, ValueError) as error:
-        text = str(error).splitlines()[0]
-        raise ReportError(f"{path}: not a readable sweep, or damaged: {text}") from error
+    with reading(path, "sweep", VERSION) as file:
+        return _read(file)
 
 
 def utc_now() -> str:

@@ -1,0 +1,57 @@
+"""HDF5 files with one result each: complete or absent, of a known format and version."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+
+from hybridve.calib.errors import ReportError
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[h5py.File]:
+    """Yield a file to write into, which appears under its name once it is complete.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    """
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with h5py.File(partial, "w") as file:
+            yield file
+        partial.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def reading(path: Path, what: str, version: int) -> Iterator[h5py.File]:
+    """Yield a file of the format ``hybridve-WHAT`` to read from.
+
+    Raises
+    ------
+    ReportError
+        If there is no such file, it is of another format, of an unknown version, or damaged.
+    """
+    if not path.is_file():
+        raise ReportError(f"{path}: there is no such {what}")
+    try:
+        with h5py.File(path, "r") as file:
+            found = file.attrs.get("format", "an unknown format")
+            if found != f"hybridve-{what}":
+                raise ReportError(f"{path}: holds {found}, expected hybridve-{what}")
+            stored = int(file.attrs["version"])
+            if stored != version:
+                raise ReportError(
+                    f"{path}: {what} version {stored}, this hybridve reads {version}; "
+                    "use the version that wrote it"
+                )
+            yield file
+    except (OSError, KeyError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise ReportError(f"{path}: not a readable {what}, or damaged: {text}") from error
