@@ -1,8 +1,7 @@
 """Reports as they are read back: known versions only, damage told in one line."""
 
 import json
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.hull.report.result_file import reading
 from hybridve.hull.report.schema import (
-    FORMAT,
     FRAME_COLUMNS,
     OFFSET,
     TABLES,
@@ -146,7 +145,7 @@ def read_report(path: Path) -> Report:
     ReportError
         If there is no such file, it is not a report, of an unknown version, or damaged.
     """
-    with _open(path) as file:
+    with reading(path, "report", VERSION) as file:
         frames = _columns(file["hybridve/frames"], FRAME_COLUMNS, may_be_absent=True)
         return Report(
             path=path,
@@ -209,34 +208,13 @@ def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float32], N
     ReportError
         As `read_report`, or if there is no such object.
     """
-    with _open(path) as file:
+    with reading(path, "report", VERSION) as file:
         if f"hybridve/objects/{name}" not in file:
             known = ", ".join(file["hybridve/objects"])
             raise ReportError(f"{path}: there is no object {name!r}; it has {known}")
         points = file[f"hybridve/objects/{name}/points"]
         start, stop = (int(value) for value in points["offset"][row : row + 2])
         return points["xyz_m"][start:stop], points["triangle"][start:stop]
-
-
-@contextmanager
-def _open(path: Path) -> Iterator[h5py.File]:
-    if not path.is_file():
-        raise ReportError(f"{path}: there is no such report")
-    try:
-        with h5py.File(path, "r") as file:
-            found = _plain(file.attrs.get("format", "an unknown format"))
-            if found != FORMAT:
-                raise ReportError(f"{path}: holds {found}, expected {FORMAT}")
-            version = int(file.attrs["version"])
-            if version != VERSION:
-                raise ReportError(
-                    f"{path}: report version {version}, this hybridve reads {VERSION}; "
-                    "use the version that wrote it"
-                )
-            yield file
-    except (OSError, KeyError, ValueError) as error:
-        text = str(error).splitlines()[0]
-        raise ReportError(f"{path}: not a readable report, or damaged: {text}") from error
 
 
 def _plain(value: Any) -> Any:
