@@ -6,7 +6,7 @@ where its pixel centres lie, the images' size) is given by the caller, never gue
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.colmap_io import read_colmap_model
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose
-from hybridve.calib.rig import Rig
+from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 FORMAT = "hybridve-rig"
 VERSION = 1
@@ -34,6 +34,10 @@ _CONVENTIONS = {
     "cam_from_world": "[R | t], row by row: x_cam = R x_world + t",
     "params": "the parameters of COLMAP's camera model, in COLMAP's order",
     "skew_px": "entry (1, 2) of the camera matrix",
+    "covariance": "lower triangle, row by row; a camera's pose errors (rx ry rz, tx ty tz) are in "
+    "its own frame, radians and metres: R_true = exp(r) R, t_true = t + (tx, ty, tz)",
+    "mounts": "cam_from_world = cam_from_tracker, then the inverse of the tracker's pose, then "
+    "the inverse of world_from_tracking",
 }
 
 #: COLMAP's numbers for its camera models (COLMAP, sensor/models.h).
@@ -114,7 +118,30 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
             }
             for camera in rig.cameras
         ],
+        **_covariance_to_dict(rig.covariance),
+        **_mounts_to_dict(rig.mounts),
         "provenance": rig.provenance,
+    }
+
+
+def _covariance_to_dict(covariance: RigCovariance | None) -> dict[str, Any]:
+    if covariance is None:
+        return {}
+    rows = [row[: index + 1].tolist() for index, row in enumerate(covariance.matrix)]
+    return {"covariance": {"labels": list(covariance.labels), "matrix": rows}}
+
+
+def _mounts_to_dict(mounts: Mapping[str, Mount]) -> dict[str, Any]:
+    if not mounts:
+        return {}
+    return {
+        "mounts": {
+            name: {
+                "cam_from_tracker": mount.cam_from_tracker.tolist(),
+                "world_from_tracking": mount.world_from_tracking.tolist(),
+            }
+            for name, mount in mounts.items()
+        }
     }
 
 
@@ -164,13 +191,39 @@ def read_rig(path: Path) -> Rig:
             )
             for entry in content["cameras"]
         )
-        return Rig(cameras, dict(content.get("provenance", {})))
+        return Rig(
+            cameras,
+            dict(content.get("provenance", {})),
+            _covariance_from_dict(content["covariance"]) if "covariance" in content else None,
+            {
+                str(name): Mount(
+                    np.array(entry["cam_from_tracker"], dtype=np.float64),
+                    np.array(entry["world_from_tracking"], dtype=np.float64),
+                )
+                for name, entry in content.get("mounts", {}).items()
+            },
+        )
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
     except KeyError as error:
-        raise CalibrationError(f"{path}: a camera has no {error}; expected {FORMAT} 1") from error
-    except (TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{path}: a camera has no {error}, or a mount or the covariance; expected {FORMAT} 1"
+        ) from error
+    except (AttributeError, TypeError, ValueError) as error:
         raise CalibrationError(f"{path}: {error}; expected {FORMAT} 1") from error
+
+
+def _covariance_from_dict(entry: Mapping[str, Any]) -> RigCovariance:
+    rows = [np.array(row, dtype=np.float64) for row in entry["matrix"]]
+    matrix = np.zeros((len(rows), len(rows)))
+    for index, row in enumerate(rows):
+        if row.shape != (index + 1,):
+            raise CalibrationError(
+                f"row {index + 1} of the covariance has shape {row.shape}, expected "
+                f"{(index + 1,)}: the lower triangle"
+            )
+        matrix[index, : index + 1] = matrix[: index + 1, index] = row
+    return RigCovariance(tuple(str(label) for label in entry["labels"]), matrix)
 
 
 def import_rig(
@@ -219,35 +272,14 @@ def import_rig(
     if not image_sizes:
         raise CalibrationError(f"{pattern}: no camera is asked for; name at least one")
     path = root / pattern
-    is_ours = path.suffix == ".json" and "{camera}" not in pattern and _is_rig_json(path)
-    if is_ours:
-        rig = read_rig(path)
-        found = [
-            _Foreign(
-                c.name, c.model, c.params, c.cam_from_world, c.skew_px, (c.width_px, c.height_px)
-            )
-            for c in rig.cameras
-        ]
-        factor_m, pixel_centre = 1.0, 0.5
-        provenance = rig.provenance
-    else:
-        found = _read_foreign(root, pattern, list(image_sizes))
-        provenance = {
-            "method": "imported",
-            "file": pattern,
-            "unit": unit,
-            "pixel_centre": pixel_centre,
-        } | ({"square_m": square_m} if unit == "squares" else {})
+    if path.suffix == ".json" and "{camera}" not in pattern and _is_rig_json(path):
+        return _choose(read_rig(path), image_sizes, pattern)
+    found = _read_foreign(root, pattern, list(image_sizes))
     cameras = []
     for name, size_px in image_sizes.items():
-        foreign = _pick(found, name, pattern)
-        if foreign.size_px is not None and foreign.size_px != tuple(size_px):
-            raise CalibrationError(
-                "{}: camera {!r} is calibrated for images of {}x{}, those of the session are "
-                "{}x{}; calibrate with the recorded size".format(
-                    pattern, name, *foreign.size_px, *size_px
-                )
-            )
+        foreign = found[_pick([(c.name, c.cam_from_world) for c in found], name, pattern)]
+        if foreign.size_px is not None:
+            _check_size(foreign.size_px, size_px, name, pattern)
         params = foreign.params.copy()
         start = 1 if _has_one_focal_length(foreign.model) else 2
         params[start : start + 2] += 0.5 - pixel_centre
@@ -267,7 +299,46 @@ def import_rig(
             )
         except CalibrationError as error:
             raise CalibrationError(f"{pattern}: {error}") from error
+    provenance = {
+        "method": "imported",
+        "file": pattern,
+        "unit": unit,
+        "pixel_centre": pixel_centre,
+    } | ({"square_m": square_m} if unit == "squares" else {})
     return Rig(tuple(cameras), provenance)
+
+
+def _choose(rig: Rig, image_sizes: dict[str, tuple[int, int]], pattern: str) -> Rig:
+    """Return the cameras asked for of a rig of ours, under the names asked for."""
+    known = [(camera.name, camera.cam_from_world) for camera in rig.cameras]
+    names = {rig.cameras[_pick(known, name, pattern)].name: name for name in image_sizes}
+    rig = rig.only(list(names))
+    for camera in rig.cameras:
+        _check_size(
+            (camera.width_px, camera.height_px),
+            image_sizes[names[camera.name]],
+            names[camera.name],
+            pattern,
+        )
+    covariance = rig.covariance
+    if covariance is not None:
+        parts = [label.rpartition(" ") for label in covariance.labels]
+        labels = tuple(f"{names[owner]} {parameter}" for owner, _, parameter in parts)
+        covariance = RigCovariance(labels, covariance.matrix)
+    return Rig(
+        tuple(replace(camera, name=names[camera.name]) for camera in rig.cameras),
+        rig.provenance,
+        covariance,
+        {names[name]: mount for name, mount in rig.mounts.items()},
+    )
+
+
+def _check_size(found: tuple[int, int], wanted: tuple[int, int], name: str, pattern: str) -> None:
+    if tuple(found) != tuple(wanted):
+        raise CalibrationError(
+            "{}: camera {!r} is calibrated for images of {}x{}, those of the session are "
+            "{}x{}; calibrate with the recorded size".format(pattern, name, *found, *wanted)
+        )
 
 
 def _metres(unit: str, square_m: float | None) -> float:
@@ -295,22 +366,22 @@ def _is_rig_json(path: Path) -> bool:
     return f'"{FORMAT}"' in path.read_text(encoding="utf-8", errors="replace")[:2000]
 
 
-def _pick(found: Iterable[_Foreign], name: str, pattern: str) -> _Foreign:
-    cameras = list(found)
+def _pick(known: Sequence[tuple[str, Pose]], name: str, pattern: str) -> int:
+    """Return which of the cameras (name, cam_from_world) is the one called `name`."""
     for matches in (
-        [camera for camera in cameras if camera.name == name],
-        [camera for camera in cameras if Path(camera.name).stem == name],
-        [camera for camera in cameras if camera.name.split("/")[0] == name],
+        [i for i, (found, _) in enumerate(known) if found == name],
+        [i for i, (found, _) in enumerate(known) if Path(found).stem == name],
+        [i for i, (found, _) in enumerate(known) if found.split("/")[0] == name],
     ):
         if len(matches) == 1:
             return matches[0]
         if matches:
-            poses = [match.cam_from_world for match in matches]
+            poses = [known[i][1] for i in matches]
             if all(np.allclose(pose, poses[0], atol=1e-9) for pose in poses):
                 return matches[0]
             raise CalibrationError(f"{pattern}: camera {name!r} stands there {len(matches)} times")
-    known = ", ".join(camera.name for camera in cameras)
-    raise CalibrationError(f"{pattern}: there is no camera {name!r}; it has {known}")
+    names = ", ".join(found for found, _ in known)
+    raise CalibrationError(f"{pattern}: there is no camera {name!r}; it has {names}")
 
 
 def _read_foreign(root: Path, pattern: str, names: list[str]) -> list[_Foreign]:

@@ -112,7 +112,7 @@ def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, 
         session.target.square_mm / 1000.0 if session.target is not None else None,
     )
     # The session's cameras in the session's order; a rig may hold more.
-    return Rig(tuple(rig[camera.name] for camera in session.cameras), rig.provenance)
+    return rig.only([camera.name for camera in session.cameras])
 
 
 def _recorded_sizes(session: Session) -> dict[str, tuple[int, int]]:
