@@ -13,7 +13,7 @@ from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict
 from hybridve.calib.target import Chessboard
 from hybridve.hull.capture.recording import recording_of
-from hybridve.hull.capture.session import RigFile, Session
+from hybridve.hull.capture.session import ChessboardTable, RigFile, Session
 
 _log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, 
         rig_file.unit or "m",
         rig_file.pixel_centre,
         sizes_px,
-        session.target.square_mm / 1000.0 if session.target is not None else None,
+        session.target.unit_m if session.target is not None else None,
     )
     # The session's cameras in the session's order; a rig may hold more.
     return rig.only([camera.name for camera in session.cameras])
@@ -139,10 +139,10 @@ def _calibrated_sizes(session: Session) -> dict[str, tuple[int, int]]:
 
 
 def _board(session: Session) -> Chessboard:
-    if session.target is None:
-        raise CalibrationError(f"{session.path}: has no [target]")
     target = session.target
-    return Chessboard(target.columns, target.rows, target.square_mm / 1000.0)
+    if not isinstance(target, ChessboardTable):
+        raise CalibrationError(f"{session.path}: has no [target] of kind chessboard")
+    return Chessboard(target.columns, target.rows, target.sides_mm[0] / 1000.0)
 
 
 def _inputs(session: Session) -> list[CameraInput]:
