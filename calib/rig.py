@@ -27,9 +27,9 @@ class RigCovariance:
     """What is known about the errors of a rig's parameters.
 
     Camera by camera in the rig's order: six pose parameters, then the lens in COLMAP's order. The
-    pose's are (omega, dt) in the camera's frame, radians and metres: the true pose is
-    ``R_true = exp(omega) @ R`` and ``t_true = t + dt``. Lenses that cameras share are repeated,
-    fully correlated; what was given and not estimated has variance zero.
+    pose's are (omega, v) in the camera's frame, radians and metres: a point that the pose leads to
+    x is, to first order, at ``x + omega x x + v``. Lenses that cameras share are repeated, fully
+    correlated; what was given and not estimated has variance zero.
 
     Attributes
     ----------
