@@ -7,7 +7,8 @@ them clockwise, which lets z point into the floor.)
 
 A board may look the same after a turn in its plane: by 180 degrees if the numbers of its inner
 corners are both even or both odd, by 90 degrees too if they are equal and even. No image of the
-board alone tells those turns apart; `Chessboard.looks` lists them.
+board alone tells those turns apart; `Chessboard.looks` lists them. Nor does it tell whether the
+image is mirrored: the mirror image of a chessboard is a chessboard.
 
 This work is based on: Geiger, Moosmann, Car and Schuster, *Automatic camera and range sensor
 calibration using a single shot*, ICRA 2012 (corners refined by the orthogonality of gradients);
@@ -18,13 +19,16 @@ ICCV workshops 2009 (refinement in the frontal view of the board).
 import csv
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.board import Detection as Detection
+from hybridve.calib.board import Effort
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.pose import Pose
 
 #: The longer side in pixels to which large images are reduced for the first search.
 _SEARCH_SIZE_PX = 1000
@@ -63,10 +67,10 @@ _CELL_PX = (20.0, 100.0)
 #: Symmetry is looked at this far around a corner, in squares, at this many places a side, after a
 #: blur that makes slopes smooth. (On real stills a smaller reach, or weights against glare, left
 #: larger errors.)
-_SYMMETRY_REACH = 0.6
+SYMMETRY_REACH = 0.6
 _SYMMETRY_STEPS = 13
 _SYMMETRY_ITERATIONS = 15
-_SYMMETRY_BLUR_PX = 0.8
+SYMMETRY_BLUR_PX = 0.8
 
 #: A corner further than this off the smooth grid through all corners, in squares, is no corner.
 _ROUGH_TOLERANCE = 0.25
@@ -88,17 +92,27 @@ class Chessboard:
     columns, rows : int
         Inner corners along x and y (a board of 9 by 7 squares has 8 by 6).
     square_m : float
-        The side of a square in metres.
+        The side of a square in metres; along x, where the two differ.
+    square_y_m : float, optional
+        The side along y in metres, of squares that were measured and are not square.
+    name : str
+        Which of several boards it is.
+    body : str, optional
+        The rigid body that it is fixed to; boards of one body move as one.
 
     Raises
     ------
     CalibrationError
-        If there are fewer than 3 corners a side, or the square has no size.
+        If there are fewer than 3 corners a side, the square has no size, or nothing tells which of
+        two different sides runs along x.
     """
 
     columns: int
     rows: int
     square_m: float
+    square_y_m: float | None = None
+    name: str = "board"
+    body: str | None = None
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:
@@ -106,20 +120,35 @@ class Chessboard:
                 f"a chessboard of {self.columns}x{self.rows} inner corners is too small; at least "
                 "3x3 are needed (count the corners inside the board, not the squares)"
             )
-        if not (np.isfinite(self.square_m) and self.square_m > 0):
-            raise CalibrationError(f"the chessboard's square is {self.square_m} m; give its side")
+        for side_m in self.sides_m:
+            if not (np.isfinite(side_m) and side_m > 0):
+                raise CalibrationError(f"the chessboard's square is {side_m} m; give its side")
+        if self.columns == self.rows and self.columns % 2 == 0 and not self._is_square:
+            raise CalibrationError(
+                f"squares of {self}: on a board of as many columns as rows, both even, nothing "
+                "tells x from y; give one side, their mean"
+            )
+
+    @property
+    def sides_m(self) -> tuple[float, float]:
+        """The sides of a square along x and y, in metres."""
+        return self.square_m, self.square_m if self.square_y_m is None else self.square_y_m
+
+    @property
+    def _is_square(self) -> bool:
+        return self.sides_m[0] == self.sides_m[1]
 
     @property
     def points_board(self) -> NDArray[np.float64]:
         """The corners, (N, 3) metres, row-major from (0, 0, 0)."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         corners = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-        return np.asarray(corners * self.square_m, np.float64)
+        return np.asarray(corners * (*self.sides_m, 0.0), np.float64)
 
     @property
     def center_board(self) -> NDArray[np.float64]:
         """The middle of the board: (3,) metres."""
-        return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2, 0.0]) * self.square_m
+        return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2, 0.0]) * (*self.sides_m, 0.0)
 
     @property
     def looks(self) -> NDArray[np.intp]:
@@ -136,7 +165,7 @@ class Chessboard:
                 quarter_turns = (0, 1, 2, 3)
         return np.array([np.rot90(grid, turns).ravel() for turns in quarter_turns], dtype=np.intp)
 
-    def board_from_turned(self, look: int) -> NDArray[np.float64]:
+    def board_from_turned(self, look: int) -> Pose:
         """Return the motion (3, 4) that maps ``points_board`` onto ``points_board[looks[look]]``.
 
         Where ``corners`` place the board at ``cam_from_board``, ``corners[looks[look]]`` place it
@@ -147,24 +176,15 @@ class Chessboard:
         rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         return np.column_stack([rotation, self.center_board - rotation @ self.center_board])
 
+    def detect(self, image: NDArray[Any], effort: Effort = "thorough") -> Detection:
+        """Find the board, all of it, in an image; see `detect_corners`."""
+        return detect_corners(image, self, effort)
+
     def __str__(self) -> str:
-        return f"{self.columns}x{self.rows} inner corners, {self.square_m * 1000:g} mm squares"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Detection:
-    """What the search for a board in one image gave.
-
-    Attributes
-    ----------
-    corners : (N, 2) float64, or None
-        Corners in pixels, pixel centre at 0.5, row-major as `Chessboard.points_board`.
-    how : str
-        The way in which they were found, or all ways that were tried in vain.
-    """
-
-    corners: NDArray[np.float64] | None
-    how: str
+        sides = f"{self.sides_m[0] * 1000:g}"
+        if not self._is_square:
+            sides += f" by {self.sides_m[1] * 1000:g}"
+        return f"{self.columns}x{self.rows} inner corners, {sides} mm squares"
 
 
 def find_corners(image: NDArray[Any], board: Chessboard) -> NDArray[np.float64] | None:
@@ -191,7 +211,7 @@ def find_corners(image: NDArray[Any], board: Chessboard) -> NDArray[np.float64] 
 def detect_corners(
     image: NDArray[Any],
     board: Chessboard,
-    effort: Literal["quick", "usual", "thorough"] = "thorough",
+    effort: Effort = "thorough",
 ) -> Detection:
     """Find the board's inner corners, and say how; see `find_corners`.
 
@@ -302,7 +322,7 @@ def list_corners(board: Chessboard, corners: NDArray[np.float64]) -> NDArray[np.
 
 def _ideal(board: Chessboard) -> NDArray[np.float64]:
     """Return the corners on a grid of unit squares, (N, 2)."""
-    return board.points_board[:, :2] / board.square_m
+    return board.points_board[:, :2] / board.sides_m
 
 
 def _grid_error(board: Chessboard, corners: NDArray[np.float64]) -> float:
@@ -321,9 +341,10 @@ def _roughness(board: Chessboard, corners: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(squares - _smooth(board, squares), axis=1).max())
 
 
-def _homography(
+def fit_homography(
     source: NDArray[np.float64], target: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
+    """Return the homography (3, 3) that maps points (N, 2) best; None if there is none."""
     try:
         found, _ = cv2.findHomography(source, target)
     except cv2.error:
@@ -336,7 +357,7 @@ def _homography(
 
 def _in_squares(board: Chessboard, corners: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Map corners to the board's plane by the best homography, in squares."""
-    matrix = _homography(corners, _ideal(board))
+    matrix = fit_homography(corners, _ideal(board))
     if matrix is None:
         return None
     depths = corners @ matrix[2, :2] + matrix[2, 2]
@@ -380,7 +401,7 @@ def _frontal(
     )
     cell = float(np.clip(np.ceil(1.2 * sides.max()), *_CELL_PX))
     view = (_ideal(board) + 2.0) * cell
-    img_from_view = _homography(view, corners - 0.5)
+    img_from_view = fit_homography(view, corners - 0.5)
     if img_from_view is None:
         return None
     size = (int((board.columns + 3) * cell), int((board.rows + 3) * cell))
@@ -412,13 +433,24 @@ def _refine(
         height, width = view.shape
         if (start < 2).any() or (start > (width - 3, height - 3)).any():
             return None
-        moved = _symmetric(view, start, cell, max(blur * cell, _SYMMETRY_BLUR_PX))
+        moved = move_to_symmetry(view, start, cell, max(blur * cell, SYMMETRY_BLUR_PX))
         corners = _mapped(img_from_view, moved) + 0.5
     return corners if _roughness(board, corners) < _ROUGH_TOLERANCE else None
 
 
-def _symmetric(
-    view: NDArray[np.float32], start: NDArray[np.float64], cell: float, blur_px: float
+def symmetry_offsets(cell: float) -> NDArray[np.float64]:
+    """Return where symmetry is looked at around a corner: (K, 2), one of each opposite pair."""
+    steps = np.linspace(-SYMMETRY_REACH * cell, SYMMETRY_REACH * cell, _SYMMETRY_STEPS)
+    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    return np.asarray(offsets[: len(offsets) // 2])
+
+
+def move_to_symmetry(
+    view: NDArray[np.float32],
+    start: NDArray[np.float64],
+    cell: float,
+    blur_px: float,
+    weights: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Move points (N, 2) to where the view looks the same when turned by 180 degrees.
 
@@ -426,12 +458,26 @@ def _symmetric(
     overexposure spreads its edges. Least squares, by Gauss-Newton, over the differences of
     opposite pixels, with linear shading fitted beside it. On rendered boards with squares of 10
     by 3 px the error is 0.01 px, that of orthogonal gradients 0.06 px.
+
+    Parameters
+    ----------
+    view : (H, W) float32
+        Grey levels, seen frontally: a square is ``cell`` by ``cell`` pixels.
+    start : (N, 2) float64
+        Pixels, pixel centre at 0, nearer to a corner than to the middle of a square.
+    cell : float
+        The side of a square in pixels.
+    blur_px : float
+        Standard deviation of the blur that makes slopes smooth.
+    weights : (N, K) float64, optional
+        How much each of `symmetry_offsets` counts, where not all of the pattern is symmetric.
     """
-    reach = _SYMMETRY_REACH * cell
-    steps = np.linspace(-reach, reach, _SYMMETRY_STEPS)
-    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    offsets = offsets[: len(offsets) // 2]  # (K, 2): one of each opposite pair
+    reach = SYMMETRY_REACH * cell
+    offsets = symmetry_offsets(cell)
     window = np.exp(-0.5 * (offsets / (0.6 * reach)) ** 2).prod(axis=1)
+    window = np.broadcast_to(window, (len(start), len(offsets)))
+    if weights is not None:
+        window = window * weights
     smooth = cv2.GaussianBlur(view, (0, 0), blur_px)
     slope_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     slope_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
@@ -451,8 +497,8 @@ def _symmetric(
             axis=-1,
         )  # (N, K, 4)
         misses = sample(smooth, ahead) - sample(smooth, behind) + shading @ offsets.T
-        normal = np.einsum("nki,k,nkj->nij", jacobian, window, jacobian) + 1e-3 * np.eye(4)
-        right = np.einsum("nki,k,nk->ni", jacobian, window, misses)
+        normal = np.einsum("nki,nk,nkj->nij", jacobian, window, jacobian) + 1e-3 * np.eye(4)
+        right = np.einsum("nki,nk,nk->ni", jacobian, window, misses)
         step = -np.linalg.solve(normal, right[..., None])[..., 0]
         shading += step[:, 2:]
         length = np.linalg.norm(step[:, :2], axis=1, keepdims=True)
