@@ -39,6 +39,12 @@ def _colmap_camera(camera: Camera) -> pycolmap.Camera:
     )
 
 
+def parameter_names(model: str) -> tuple[str, ...]:
+    """Return the names of a model's parameters in COLMAP's order: fx, fy, cx, cy, k1, ..."""
+    camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1)
+    return tuple(name.strip() for name in camera.params_info.split(","))
+
+
 def project_points(
     camera: Camera, points_world: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

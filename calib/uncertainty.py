@@ -1,0 +1,394 @@
+"""How far a rig can be wrong: its covariance, and what that means in space and in images.
+
+The covariance is that of the joint adjustment (`hybridve.calib.bundle`), for the noise that its
+residuals show. Residuals are told apart into what is smooth over a board, by which parameters are
+moved, and what is not, the noise of single points: a lens model that does not fit, a bent board or
+motion blur raise the former, and the covariance with it.
+
+This work is based on: Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle adjustment: a modern
+synthesis*, 2000 (section 9); Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., 2003
+(sections 5.1 and 5.2, error of estimation and propagation of covariance).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from hybridve.calib.board import is_seen
+from hybridve.calib.bundle import POSE, Adjusted, lens_derivatives
+from hybridve.calib.camera import Camera
+from hybridve.calib.lens import cam_from_img, img_from_cam, parameter_names
+from hybridve.calib.pose import transform
+from hybridve.calib.rig import Rig, RigCovariance
+
+#: What is smooth over a board: polynomials in its coordinates up to this degree.
+_SMOOTH_DEGREE = 3
+
+#: Weak knowledge of what no picture told, as standard deviations: a rotation (radians), a place
+#: (metres), and by its share a focal length or, by the image's width, a principal point; the
+#: coefficients of distortion. It keeps the covariance finite where the pictures tell nothing, and
+#: changes what they tell by less than a millionth.
+_PRIOR_RAD = np.pi
+_PRIOR_M = 100.0
+_PRIOR_SHARE = 1.0
+_PRIOR_DISTORTION = 10.0
+
+_POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+#: Points on an octant of the sphere over which `radius95` integrates, a side.
+_SPHERE_POINTS = 24
+
+#: Points of a pixel grid over an image, a side, for the error within the image.
+_IMAGE_POINTS = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """How noisy the points of boards were.
+
+    Attributes
+    ----------
+    rough_px : float
+        Standard deviation of a coordinate from point to point: the noise of finding points.
+    smooth_px : float
+        The same as the smooth part of the residuals shows it; what moves the parameters. Equal to
+        `rough_px` where model and boards are right.
+    rms_px : float
+        Root mean square length of the residuals.
+    share_explained : float
+        Share of the sum of squares that the noise of single points explains, up to 1.
+    n_points, n_parameters : int
+        Points seen, and parameters adjusted to them.
+    """
+
+    rough_px: float
+    smooth_px: float
+    rms_px: float
+    share_explained: float
+    n_points: int
+    n_parameters: int
+
+
+def measure_noise(adjusted: Adjusted) -> Noise:
+    """Return how noisy the points of an adjusted bundle were."""
+    bundle = adjusted.bundle
+    smooth_squares = rough_squares = 0.0
+    n_smooth = n_rough = n_points = 0
+    for view, missed in zip(bundle.views, adjusted.residuals_px, strict=True):
+        seen = is_seen(view.pixels)
+        points, rows = bundle.points_board[view.board][seen, :2], missed[seen]
+        basis = _smooth_basis(points)
+        fitted = basis @ (basis.T @ rows)
+        smooth_squares += float((fitted**2).sum())
+        rough_squares += float(((rows - fitted) ** 2).sum())
+        n_smooth += 2 * basis.shape[1]
+        n_rough += 2 * (len(rows) - basis.shape[1])
+        n_points += len(rows)
+    n_parameters = adjusted.layout.size + POSE * (len(bundle.rig_from_body) - 1)
+    total = smooth_squares + rough_squares
+    pooled = total / max(1, 2 * n_points - n_parameters)
+    rough = rough_squares / n_rough if n_rough else pooled
+    # The parameters have taken their share of what is smooth.
+    left = n_smooth - n_parameters
+    smooth = max(smooth_squares / left, rough) if left > n_smooth / 10 else max(pooled, rough)
+    expected = rough * max(1, 2 * n_points - n_parameters)
+    return Noise(
+        float(np.sqrt(rough)),
+        float(np.sqrt(smooth)),
+        float(np.sqrt(total / max(1, n_points))),
+        min(1.0, expected / total) if total > 0 else 1.0,
+        n_points,
+        n_parameters,
+    )
+
+
+def _smooth_basis(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an orthonormal basis (S, K) of the smooth functions over points (S, 2) of a board."""
+    centred = points - points.mean(axis=0)
+    x, y = (centred / max(float(np.abs(centred).max()), 1e-12)).T
+    degree = _SMOOTH_DEGREE
+    terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+    u, values, _ = np.linalg.svd(np.column_stack(terms), full_matrices=False)
+    return np.asarray(u[:, values > 1e-9 * values[0]])
+
+
+def rig_covariance(adjusted: Adjusted, sigma_px: float) -> RigCovariance:
+    """Return the covariance of an adjusted rig's parameters.
+
+    Parameters
+    ----------
+    adjusted : Adjusted
+        After `hybridve.calib.bundle.adjust`; its held pose is the world.
+    sigma_px : float
+        Standard deviation of a coordinate of a point, pixels.
+    """
+    bundle, layout = adjusted.bundle, adjusted.layout
+    prior = np.zeros(layout.size)
+    for span in (*layout.of_camera, *layout.of_board.values()):
+        prior[span] = [_PRIOR_RAD**-2] * 3 + [_PRIOR_M**-2] * 3
+    for camera, lens in zip(bundle.cameras, bundle.lens_of, strict=True):
+        if lens in layout.of_lens:
+            prior[layout.of_lens[lens]] = _prior_of_lens(camera) ** -2
+    if sigma_px > 0:
+        information = adjusted.information / sigma_px**2 + np.diag(prior)
+        scale = np.sqrt(np.diag(information))
+        inverse = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    else:
+        inverse = np.zeros_like(adjusted.information)  # points without noise
+    columns: list[int | None] = []
+    labels: list[str] = []
+    for index, camera in enumerate(bundle.cameras):
+        span = layout.of_camera[index]
+        columns += range(span.start, span.stop)
+        lens_span = layout.of_lens.get(bundle.lens_of[index])
+        if lens_span is None:
+            columns += [None] * len(camera.params)
+        else:
+            columns += range(lens_span.start, lens_span.stop)
+        labels += [
+            f"{camera.name} {what}" for what in (*_POSE_NAMES, *parameter_names(camera.model))
+        ]
+    taken = np.array([0 if column is None else column for column in columns])
+    matrix = inverse[np.ix_(taken, taken)]
+    given = np.array([column is None for column in columns])
+    matrix[given] = 0.0
+    matrix[:, given] = 0.0
+    return RigCovariance(tuple(labels), (matrix + matrix.T) / 2.0)
+
+
+def _prior_of_lens(camera: Camera) -> NDArray[np.float64]:
+    """Return the standard deviations (P,) of what is known of a lens without a picture."""
+    prior = np.full(len(camera.params), _PRIOR_DISTORTION)
+    for index, name in enumerate(parameter_names(camera.model)):
+        if name.startswith("f"):
+            prior[index] = _PRIOR_SHARE * camera.params[index]
+        elif name.startswith("c"):
+            prior[index] = _PRIOR_SHARE * camera.width_px
+    return prior
+
+
+# --- In images and in space -------------------------------------------------------------------
+
+
+def parameter_slices(rig: Rig) -> list[slice]:
+    """Return where each camera's parameters stand in the covariance."""
+    ends = np.cumsum([POSE + len(camera.params) for camera in rig.cameras])
+    return [
+        slice(int(end) - POSE - len(camera.params), int(end))
+        for end, camera in zip(ends, rig.cameras, strict=True)
+    ]
+
+
+def image_derivatives(
+    camera: Camera, points_world: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how a camera's image of points changes with the points and with its parameters.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    points_world : (N, 3) float64
+        Points in metres.
+
+    Returns
+    -------
+    by_point : (N, 2, 3) float64
+        Pixels a metre in the world's frame.
+    by_parameter : (N, 2, 6 + P) float64
+        Pixels a unit of the pose's (omega, v) and of the lens's parameters. Both are NaN where the
+        camera does not see the point.
+    """
+    n_points = len(points_world)
+    by_point = np.full((n_points, 2, 3), np.nan)
+    by_parameter = np.full((n_points, 2, POSE + len(camera.params)), np.nan)
+    points_cam = transform(camera.cam_from_world, points_world)
+    seen = _is_in_image(camera, points_cam)
+    if seen.any():
+        by_cam, by_lens = lens_derivatives(camera, points_cam[seen])
+        by_point[seen] = by_cam @ camera.cam_from_world[:, :3]
+        turned = np.cross(points_cam[seen][:, None, :], by_cam)
+        by_parameter[seen] = np.concatenate([turned, by_cam, by_lens], axis=2)
+    return by_point, by_parameter
+
+
+def _is_in_image(camera: Camera, points_cam: NDArray[np.float64]) -> NDArray[np.bool_]:
+    seen = points_cam[:, 2] > 0
+    pixels = np.full((len(points_cam), 2), np.nan)
+    if seen.any():
+        pixels[seen] = img_from_cam(camera, points_cam[seen])
+    size = (camera.width_px, camera.height_px)
+    with np.errstate(invalid="ignore"):
+        seen &= ((pixels >= 0) & (pixels < size)).all(axis=1)
+    # The polynomial of a lens folds back far outside the image: the pixel must lead back.
+    if camera.has_distortion and seen.any():
+        rays = cam_from_img(camera, pixels[seen])
+        expected = points_cam[seen, :2] / points_cam[seen, 2:]
+        with np.errstate(invalid="ignore"):
+            near = np.linalg.norm(rays - expected, axis=1) < 1e-3 * (
+                1.0 + np.linalg.norm(expected, axis=1)
+            )
+        seen[seen] = near
+    return seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointErrors:
+    """What a rig's errors do to points in space.
+
+    Attributes
+    ----------
+    covariance_m2 : (N, 3, 3) float64
+        Of the place at which the cameras see a point, least squares over those that do; NaN where
+        fewer than two do.
+    radius95_m : (N,) float64
+        The distance that this error exceeds in 5 % of all calibrations.
+    n_seeing : (N,) int
+        Cameras that see the point.
+    """
+
+    covariance_m2: NDArray[np.float64]
+    radius95_m: NDArray[np.float64]
+    n_seeing: NDArray[np.intp]
+
+
+def point_errors(
+    rig: Rig, points_world: NDArray[np.float64], covariance: NDArray[np.float64] | None = None
+) -> PointErrors:
+    """Return how far from the truth the cameras place points, for the rig's errors alone.
+
+    Parameters
+    ----------
+    rig : Rig
+        With its covariance.
+    points_world : (N, 3) float64
+        Points in metres.
+    covariance : (P, P) float64, optional
+        Another one than the rig's, in its order.
+
+    Raises
+    ------
+    ValueError
+        If the rig has no covariance.
+    """
+    gains, n_seeing = point_gains(rig, points_world)
+    matrix = _matrix(rig) if covariance is None else covariance
+    covariance_m2 = gains @ matrix @ gains.transpose(0, 2, 1)
+    return PointErrors(covariance_m2, radius95(covariance_m2), n_seeing)
+
+
+def point_gains(
+    rig: Rig, points_world: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return how points move as the rig's parameters do, and how many cameras see them.
+
+    Returns
+    -------
+    gains : (N, 3, P) float64
+        Metres a unit of each parameter: where the truth is off by dp, a point that is seen from
+        the truth is placed ``gains @ dp`` off. NaN where fewer than two cameras see the point.
+    n_seeing : (N,) int
+        Cameras that do.
+    """
+    n_points, slices = len(points_world), parameter_slices(rig)
+    information = np.zeros((n_points, 3, 3))
+    moments = np.zeros((n_points, 3, slices[-1].stop))
+    n_seeing = np.zeros(n_points, dtype=np.intp)
+    for camera, span in zip(rig.cameras, slices, strict=True):
+        by_point, by_parameter = image_derivatives(camera, points_world)
+        seen = np.isfinite(by_point).all(axis=(1, 2))
+        information[seen] += by_point[seen].transpose(0, 2, 1) @ by_point[seen]
+        moments[seen, :, span] = by_point[seen].transpose(0, 2, 1) @ by_parameter[seen]
+        n_seeing += seen
+    gains = np.full_like(moments, np.nan)
+    placed = n_seeing >= 2
+    if placed.any():
+        gains[placed] = np.linalg.solve(information[placed], moments[placed])
+    return gains, n_seeing
+
+
+def pixel_covariance(rig: Rig, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance of where the cameras see points, for the rig's errors alone.
+
+    Parameters
+    ----------
+    rig : Rig
+        With its covariance.
+    points_world : (N, 3) float64
+        Points in metres.
+
+    Returns
+    -------
+    (N, C, 2, C, 2) float64
+        Pixels squared, true minus computed image; NaN where a camera does not see the point.
+
+    Raises
+    ------
+    ValueError
+        If the rig has no covariance.
+    """
+    matrix, slices = _matrix(rig), parameter_slices(rig)
+    n_cameras = len(rig.cameras)
+    derivatives = [image_derivatives(camera, points_world)[1] for camera in rig.cameras]
+    found = np.zeros((len(points_world), n_cameras, 2, n_cameras, 2))
+    for i, first in enumerate(derivatives):
+        for j, second in enumerate(derivatives):
+            found[:, i, :, j] = first @ matrix[slices[i], slices[j]] @ second.transpose(0, 2, 1)
+    return found
+
+
+def _matrix(rig: Rig) -> NDArray[np.float64]:
+    if rig.covariance is None:
+        raise ValueError("the rig has no covariance")
+    return rig.covariance.matrix
+
+
+def radius95(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the radius within which 95 % of a normal error about zero lies.
+
+    Parameters
+    ----------
+    covariance : (N, D, D) float64
+        Of an error in D = 2 or 3 dimensions; NaN gives NaN.
+
+    Returns
+    -------
+    (N,) float64
+        In the root of the covariance's unit, relative error below 1e-3.
+    """
+    radii = np.full(len(covariance), np.nan)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    if not known.any():
+        return radii
+    values = np.linalg.eigvalsh(covariance[known])
+    variances = np.zeros((len(values), 3))
+    variances[:, : values.shape[1]] = np.maximum(values, 0.0)
+    largest = variances.max(axis=1)
+    shares = variances / np.where(largest > 0, largest, 1.0)[:, None]
+    # In spherical coordinates: the squared radius of a standard normal error is chi-squared with
+    # three degrees of freedom in each direction n, and stretched by q(n) = sum of shares n^2.
+    cosines, weights = np.polynomial.legendre.leggauss(_SPHERE_POINTS)
+    cosine, angle = (cosines + 1.0) / 2.0, (cosines + 1.0) * np.pi / 4.0
+    sine = np.sqrt(1.0 - cosine**2)
+    directions = np.stack(
+        [
+            np.outer(sine, np.cos(angle)) ** 2,
+            np.outer(sine, np.sin(angle)) ** 2,
+            np.repeat(cosine[:, None] ** 2, _SPHERE_POINTS, axis=1),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    weight = np.outer(weights, weights).ravel() / 4.0
+    # The largest share lies on the polar axis, where the points are densest in q.
+    stretch = np.maximum(np.sort(shares, axis=1) @ directions.T, 1e-300)  # (N, directions)
+    low, high = np.full(len(shares), 3.0), np.full(len(shares), 8.0)  # chi-squared, 1 and 3
+    for _ in range(16):
+        middle = (low + high) / 2.0
+        y = np.sqrt(middle[:, None] / (2.0 * stretch))
+        inside = erf(y) - 2.0 / np.sqrt(np.pi) * y * np.exp(-np.minimum(y**2, 700.0))
+        enough = inside @ weight >= 0.95
+        high, low = np.where(enough, middle, high), np.where(enough, low, middle)
+    radii[known] = np.sqrt(high * largest)
+    return radii
