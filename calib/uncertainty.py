@@ -11,6 +11,7 @@ synthesis*, 2000 (section 9); Hartley and Zisserman, *Multiple View Geometry*, 2
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,9 @@ _POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 #: Points on an octant of the sphere over which `radius95` integrates, a side.
 _SPHERE_POINTS = 24
+
+#: Entries a side of the table from which `radius95` reads, linearly between them.
+_TABLE_POINTS = 33
 
 #: Points of a pixel grid over an image, a side, for the error within the image.
 _IMAGE_POINTS = 9
@@ -367,6 +371,26 @@ def radius95(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     variances[:, : values.shape[1]] = np.maximum(values, 0.0)
     largest = variances.max(axis=1)
     shares = variances / np.where(largest > 0, largest, 1.0)[:, None]
+    ordered = np.sort(shares, axis=1)[:, :2] * (_TABLE_POINTS - 1)  # the largest share is one
+    low = np.minimum(ordered.astype(int), _TABLE_POINTS - 2)
+    (u, v), (i, j) = (ordered - low).T, low.T
+    table = _squared_radii95()
+    squared = (
+        table[i, j] * (1 - u) * (1 - v)
+        + table[i + 1, j] * u * (1 - v)
+        + table[i, j + 1] * (1 - u) * v
+        + table[i + 1, j + 1] * u * v
+    )
+    radii[known] = np.sqrt(squared * largest)
+    return radii
+
+
+@lru_cache(maxsize=1)
+def _squared_radii95() -> NDArray[np.float64]:
+    """Return the squared radii of errors with variances (i / n, j / n, 1): (n + 1, n + 1)."""
+    steps = np.linspace(0.0, 1.0, _TABLE_POINTS)
+    shares = np.stack([*np.meshgrid(steps, steps, indexing="ij")], axis=-1).reshape(-1, 2)
+    shares = np.column_stack([shares, np.ones(len(shares))])
     # In spherical coordinates: the squared radius of a standard normal error is chi-squared with
     # three degrees of freedom in each direction n, and stretched by q(n) = sum of shares n^2.
     cosines, weights = np.polynomial.legendre.leggauss(_SPHERE_POINTS)
@@ -381,8 +405,7 @@ def radius95(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         axis=-1,
     ).reshape(-1, 3)
     weight = np.outer(weights, weights).ravel() / 4.0
-    # The largest share lies on the polar axis, where the points are densest in q.
-    stretch = np.maximum(np.sort(shares, axis=1) @ directions.T, 1e-300)  # (N, directions)
+    stretch = np.maximum(shares @ directions.T, 1e-300)  # (N, directions)
     low, high = np.full(len(shares), 3.0), np.full(len(shares), 8.0)  # chi-squared, 1 and 3
     for _ in range(16):
         middle = (low + high) / 2.0
@@ -390,5 +413,4 @@ def radius95(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         inside = erf(y) - 2.0 / np.sqrt(np.pi) * y * np.exp(-np.minimum(y**2, 700.0))
         enough = inside @ weight >= 0.95
         high, low = np.where(enough, middle, high), np.where(enough, low, middle)
-    radii[known] = np.sqrt(high * largest)
-    return radii
+    return np.asarray((low + high).reshape(_TABLE_POINTS, _TABLE_POINTS) / 2.0)
