@@ -1,24 +1,29 @@
-"""Rigs on disk: our rig.json, and rigs that were calibrated elsewhere.
+"""Rigs on disk: our rig.json, and the files of other programs, read and written.
 
-Taken are rig.json, rows of 3x4 matrices, Middlebury's ``*_par.txt``, folders with a COLMAP model,
-and OpenCV's XML, YAML or JSON, one file a camera. What a foreign file does not say (its unit,
+A foreign file is recognised by what it holds, not by its name. What it does not say (its unit,
 where its pixel centres lie, the images' size) is given by the caller, never guessed.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
-from hybridve.calib.colmap_io import read_colmap_model
+from hybridve.calib.colmap_io import read_colmap_model, write_colmap_model
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.pose import Pose
+from hybridve.calib.formats import caliscope, kalibr, multical, opencv, rows
+from hybridve.calib.formats.approximate import approximate
+from hybridve.calib.formats.foreign import (
+    ForeignCamera,
+    ForeignRig,
+    principal_point_index,
+    read_text,
+)
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 FORMAT = "hybridve-rig"
@@ -40,64 +45,74 @@ _CONVENTIONS = {
     "the inverse of world_from_tracking",
 }
 
-#: COLMAP's numbers for its camera models (COLMAP, sensor/models.h).
-_COLMAP_MODEL_IDS = {
-    0: "SIMPLE_PINHOLE",
-    1: "PINHOLE",
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    5: "OPENCV_FISHEYE",
-    6: "FULL_OPENCV",
-    7: "FOV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-    12: "SIMPLE_DIVISION",
-    13: "DIVISION",
-    14: "SIMPLE_FISHEYE",
-    15: "FISHEYE",
-    16: "EUCM",
+#: Stands for a camera's name in the path of a rig that is one file a camera.
+PLACEHOLDER = "{camera}"
+
+#: The files of a COLMAP text model that are written.
+_COLMAP_FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
+
+#: OpenCV's models as targets of an approximation, with so many free parameters.
+_OPENCV_5 = (("FULL_OPENCV", 9), ("OPENCV_FISHEYE", 8))
+_OPENCV_8 = (("FULL_OPENCV", 12), ("OPENCV_FISHEYE", 8))
+_KALIBR_MODELS = (("OPENCV", 8), ("OPENCV_FISHEYE", 8), ("EUCM", 6), ("FOV", 5))
+
+
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """A format to write: what it can hold, and what of a rig stays behind.
+
+    Attributes
+    ----------
+    refusal : callable
+        Why it cannot hold a camera, or None.
+    substitutes : tuple of (str, int)
+        The lens models to approximate another one with; see `approximate`.
+    unit : str or None
+        The unit that it fixes.
+    """
+
+    refusal: Callable[[Camera], str | None]
+    substitutes: tuple[tuple[str, int], ...] = ()
+    unit: str | None = None
+
+
+def _colmap_refusal(camera: Camera) -> str | None:
+    return f"a skew of {camera.skew_px:.3g} px" if camera.skew_px else None
+
+
+_TARGETS = {
+    "json": _Target(lambda _: None, unit="m"),
+    "colmap": _Target(_colmap_refusal),
+    "opencv": _Target(opencv.refusal, _OPENCV_8),
+    "csv": _Target(rows.refusal),
+    "caliscope": _Target(caliscope.refusal, _OPENCV_5, unit="m"),
+    "aniposelib": _Target(caliscope.refusal, _OPENCV_5),
+    "kalibr": _Target(kalibr.refusal, _KALIBR_MODELS, unit="m"),
+    "multical": _Target(multical.refusal, _OPENCV_8),
 }
 
-#: How files of OpenCV's kind spell what they hold, in lower case without "_", "-" and blanks.
-_OPENCV_KEYS = {
-    "matrix": ("cameramatrix", "mtx", "k", "intrinsicmatrix", "intrinsics", "intrinsic", "m"),
-    "distortion": (
-        "distortioncoefficients",
-        "distortioncoeffs",
-        "distcoeffs",
-        "distortion",
-        "dist",
-        "d",
-    ),
-    "rotation": ("rvec", "rotation", "rotationvalues", "rotationmatrix", "rotationvector", "r"),
-    "translation": ("tvec", "translation", "translationvalues", "translationvector", "t"),
-    "pose": ("camfromworld", "extrinsicmatrix", "extrinsics", "extrinsic", "rt"),
-    "model": ("distortionmodel", "cameramodel", "model"),
-    "width": ("imagewidth", "width"),
-    "height": ("imageheight", "height"),
-}
-
-#: A rotation with this error (largest entry of RR'-I) was rounded; beyond it, it is none.
-_ROUNDED_ROTATION = 1e-3
+#: The short names of the formats that are written, and read.
+FORMATS = tuple(_TARGETS)
 
 
-#: A skew below this comes from the decomposition's own rounding.
-_NO_SKEW_PX = 1e-9
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What became of a rig in another format.
 
+    Attributes
+    ----------
+    files : tuple of Path
+        The files written.
+    approximated : dict of str to dict
+        For each camera whose lens the format does not have: "model", what stands for it, and
+        "error_px", the largest distance between the two images of a ray.
+    lost : tuple of str
+        What of the rig the format has no place for, in words.
+    """
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Foreign:
-    """A camera as a foreign file has it: its own unit, its own pixel centre, perhaps no size."""
-
-    name: str
-    model: str
-    params: NDArray[np.float64]
-    cam_from_world: Pose
-    skew_px: float = 0.0
-    size_px: tuple[int, int] | None = None
+    files: tuple[Path, ...]
+    approximated: dict[str, dict[str, Any]]
+    lost: tuple[str, ...]
 
 
 def rig_to_dict(rig: Rig) -> dict[str, Any]:
@@ -147,13 +162,11 @@ def _mounts_to_dict(mounts: Mapping[str, Mount]) -> dict[str, Any]:
 
 def write_rig(path: Path, rig: Rig) -> None:
     """Write a rig.json; the file appears only when it is complete."""
-    text = json.dumps(rig_to_dict(rig), indent=1, allow_nan=False)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(text + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+    _write_texts({path: _rig_json(rig)})
+
+
+def _rig_json(rig: Rig) -> str:
+    return json.dumps(rig_to_dict(rig), indent=1, allow_nan=False) + "\n"
 
 
 def read_rig(path: Path) -> Rig:
@@ -229,12 +242,12 @@ def _covariance_from_dict(entry: Mapping[str, Any]) -> RigCovariance:
 def import_rig(
     root: Path,
     pattern: str,
-    unit: str,
-    pixel_centre: float,
-    image_sizes: dict[str, tuple[int, int]],
+    unit: str | None,
+    pixel_centre: float | None,
+    image_sizes: Mapping[str, tuple[int, int]],
     square_m: float | None,
 ) -> Rig:
-    """Read a rig that was calibrated elsewhere.
+    """Read a rig that was calibrated elsewhere, for cameras that are known.
 
     Parameters
     ----------
@@ -243,12 +256,14 @@ def import_rig(
     pattern : str
         A file for all cameras, the folder of a COLMAP model, or, with the placeholder
         ``{camera}``, one file a camera; then the name inside a file does not count.
-    unit : str
-        "m", "cm", "mm", "in", "ft" or "squares": that of the file's translations. Of no
-        consequence for rig.json, which is in metres.
-    pixel_centre : float
-        Where the file has the centre of the top-left pixel: 0.5 (COLMAP) or 0 (OpenCV).
-    image_sizes : dict of str to (width, height)
+    unit : str or None
+        "m", "cm", "mm", "in", "ft" or "squares": that of the file's translations. None: the one
+        that its format fixes, or that stands in the file. Of no consequence for rig.json.
+    pixel_centre : float or None
+        Where the file has the centre of the top-left pixel: 0.5 (COLMAP) or 0 (OpenCV). None: where
+        such files usually have it. Of no consequence where the format fixes it: for rig.json,
+        COLMAP models, Caliscope, aniposelib, Kalibr and multical.
+    image_sizes : mapping of str to (width, height)
         The cameras wanted and the sizes of their images in pixels. Names in the file may have an
         ending that these have not ("cam1.png").
     square_m : float or None
@@ -264,62 +279,275 @@ def import_rig(
     CalibrationError
         Saying which file or camera, what was found and what was expected.
     """
+    if not image_sizes:
+        raise CalibrationError(f"{pattern}: no camera is asked for; name at least one")
+    factor_m = None if unit is None else _metres(unit, square_m)
+    found = _read(root, pattern, list(image_sizes))
+    if isinstance(found, Rig):
+        return _choose(found, image_sizes, pattern)
+    rig = _to_rig(found, pattern, unit, factor_m, pixel_centre, image_sizes)
+    if unit == "squares":
+        rig = replace(rig, provenance={**rig.provenance, "square_m": square_m})
+    return rig
+
+
+def read_any_rig(
+    source: Path,
+    *,
+    unit: str | None = None,
+    pixel_centre: float | None = None,
+    image_size: tuple[int, int] | None = None,
+    names: Sequence[str] = (),
+) -> Rig:
+    """Read a rig in any of the `FORMATS`, recognised by its content.
+
+    Parameters
+    ----------
+    source : Path
+        A file, the folder of a COLMAP model, or, with the placeholder ``{camera}``, one file a
+        camera.
+    unit : str or None
+        See `import_rig`.
+    pixel_centre : float or None
+        See `import_rig`.
+    image_size : (width, height) or None
+        For files that do not say it.
+    names : sequence of str
+        The cameras wanted, in this order; none: all.
+
+    Raises
+    ------
+    CalibrationError
+        Saying which file or camera, what was found and what was expected.
+    """
+    pattern = str(source)
+    factor_m = None if unit is None else _metres(unit, None)
+    wanted = list(names)
+    if PLACEHOLDER in pattern and not wanted:
+        wanted = _names_on_disk(source)
+    found = _read(Path(), pattern, wanted)
+    if isinstance(found, Rig):
+        if not names:
+            return found
+        known = [camera.name for camera in found.cameras]
+        return found.only([known[_pick(found.cameras, name, pattern)] for name in names])
+    if not wanted and found.incomplete:
+        missing = "; ".join(f"{name!r} has no {what}" for name, what in found.incomplete.items())
+        raise CalibrationError(f"{pattern}: {missing}; calibrate it, or name the cameras wanted")
+    sizes: dict[str, tuple[int, int]] = {}
+    for name in wanted or [camera.name for camera in found.cameras]:
+        size_px = _foreign(found, name, pattern).size_px or image_size
+        if size_px is None:
+            raise CalibrationError(
+                f"{pattern}: does not say the image size of camera {name!r}; give it"
+            )
+        sizes[name] = size_px
+    return _to_rig(found, pattern, unit, factor_m, pixel_centre, sizes)
+
+
+def output_files(rig: Rig, to: str, target: Path) -> list[Path]:
+    """Return the files that `export_rig` writes.
+
+    Raises
+    ------
+    CalibrationError
+        If the format needs another kind of path.
+    """
+    if to == "colmap":
+        return [target / name for name in _COLMAP_FILES]
+    if to != "opencv":
+        if PLACEHOLDER in str(target):
+            raise CalibrationError(f"{target}: {to} is one file for all cameras; name one file")
+        return [target]
+    if target.suffix.lower() not in opencv.SUFFIXES:
+        raise CalibrationError(
+            f"{target}: OpenCV writes {', '.join(opencv.SUFFIXES)}; end the name with one of them"
+        )
+    if PLACEHOLDER not in str(target) and len(rig.cameras) > 1:
+        raise CalibrationError(
+            f"{target}: OpenCV's files hold one camera, the rig has {len(rig.cameras)}; put "
+            f"{PLACEHOLDER} into the path, or name one camera"
+        )
+    for camera in rig.cameras:
+        if PLACEHOLDER in str(target) and ("/" in camera.name or camera.name in {".", ".."}):
+            raise CalibrationError(f"{target}: {camera.name!r} cannot be part of a file's name")
+    return [Path(str(target).replace(PLACEHOLDER, camera.name)) for camera in rig.cameras]
+
+
+def export_rig(
+    rig: Rig, to: str, target: Path, *, unit: str | None = None, approximate_lenses: bool = False
+) -> Written:
+    """Write a rig in another format; all files stand complete, or none.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+    to : str
+        One of `FORMATS`.
+    target : Path
+        The file; for "colmap" the folder; for "opencv", with more than one camera, a path with
+        the placeholder ``{camera}``.
+    unit : str or None
+        Of the translations: a key of `UNITS_M`. None: metres.
+    approximate_lenses : bool
+        Whether a lens model that the format lacks is replaced by the nearest that it has.
+
+    Raises
+    ------
+    CalibrationError
+        If the format cannot hold a camera, or the unit, or the files cannot be written.
+    """
+    known = _TARGETS[to]
+    unit = unit or "m"
+    unit_m = _metres(unit, None)
+    if known.unit not in {None, unit}:
+        raise CalibrationError(f"{target}: {to} is in {known.unit} by definition, not in {unit}")
+    files = output_files(rig, to, target)
+    cameras, approximated = [], {}
+    for camera in rig.cameras:
+        why = known.refusal(camera)
+        if why is not None:
+            reason = f"{target}: {to} cannot hold camera {camera.name!r}: it has {why}"
+            # Only another lens can be put in a lens's place.
+            if not known.substitutes or not camera.has_distortion:
+                raise CalibrationError(reason)
+            if not approximate_lenses:
+                raise CalibrationError(
+                    f"{reason}; --approximate takes the nearest lens it can hold"
+                )
+            camera, error_px = approximate(camera, known.substitutes)
+            approximated[camera.name] = {"model": camera.model, "error_px": error_px}
+        cameras.append(camera)
+    if to == "colmap":
+        moved = [
+            replace(c, cam_from_world=c.cam_from_world * [1.0, 1.0, 1.0, 1.0 / unit_m])
+            for c in cameras
+        ]
+        write_colmap_model(target, Rig(tuple(moved)))
+    else:
+        texts: dict[str, Callable[[], list[str]]] = {
+            "json": lambda: [_rig_json(rig)],
+            "opencv": lambda: [
+                opencv.write_opencv(camera, target.suffix.lower(), unit_m) for camera in cameras
+            ],
+            "csv": lambda: [rows.write_rows(cameras, unit_m)],
+            "caliscope": lambda: [caliscope.write_caliscope(cameras)],
+            "aniposelib": lambda: [caliscope.write_aniposelib(cameras, unit, unit_m)],
+            "kalibr": lambda: [kalibr.write_chain(cameras)],
+            "multical": lambda: [multical.write_multical(cameras, unit_m)],
+        }
+        _make_camera_folders(target, files)
+        _write_texts(dict(zip(files, texts[to](), strict=True)))
+    return Written(tuple(files), approximated, tuple(_lost(rig, to)))
+
+
+def _lost(rig: Rig, to: str) -> Iterable[str]:
+    """Say what of a rig a format has no place for."""
+    if to == "json":
+        return
+    names = [camera.name for camera in rig.cameras]
+    if to == "csv":
+        yield "the image sizes"
+    if to == "kalibr":
+        yield f"the world: it is the frame of {names[0]!r} now"
+        pairs = ", ".join(f"cam{number} is {name!r}" for number, name in enumerate(names))
+        yield f"the cameras' names, but for the topics: {pairs}"
+    if to == "caliscope":
+        ids = caliscope.camera_ids(names)
+        pairs = ", ".join(f"{i} is {name!r}" for i, name in zip(ids, names, strict=True))
+        yield f"the cameras' names: {pairs}"
+    if rig.covariance is not None:
+        yield "the covariance"
+    if rig.mounts:
+        yield f"the mounts of {', '.join(rig.mounts)} on their trackers"
+
+
+def _make_camera_folders(target: Path, files: Sequence[Path]) -> None:
+    """Make the folders that are named after cameras; those above must be there."""
+    parent = target.parent
+    while PLACEHOLDER in str(parent):
+        parent = parent.parent
+    for path in files if parent.is_dir() else ():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CalibrationError(f"{path.parent}: cannot be made ({error.strerror})") from error
+
+
+def _write_texts(texts: Mapping[Path, str]) -> None:
+    """Write text files, none under its final name before all are complete."""
+    partials = {path: path.with_name(path.name + ".partial") for path in texts}
+    try:
+        for path, text in texts.items():
+            partials[path].write_text(text, encoding="utf-8")
+        for path in texts:
+            partials[path].replace(path)
+    except OSError as error:
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)
+        named = error.filename or next(iter(texts))
+        raise CalibrationError(
+            f"{str(named).removesuffix('.partial')}: cannot be written ({error.strerror})"
+        ) from error
+
+
+def _to_rig(
+    found: ForeignRig,
+    pattern: str,
+    unit: str | None,
+    factor_m: float | None,
+    pixel_centre: float | None,
+    image_sizes: Mapping[str, tuple[int, int]],
+) -> Rig:
+    """Return the cameras of a foreign rig that `image_sizes` names, in metres and our pixels."""
+    if found.is_centre_fixed or pixel_centre is None:
+        pixel_centre = found.pixel_centre
     if pixel_centre not in (0.0, 0.5):
         raise CalibrationError(
             f"the rig's pixel centre is {pixel_centre!r}; expected 0.5 (COLMAP) or 0 (OpenCV)"
         )
-    factor_m = _metres(unit, square_m)
-    if not image_sizes:
-        raise CalibrationError(f"{pattern}: no camera is asked for; name at least one")
-    path = root / pattern
-    if path.suffix == ".json" and "{camera}" not in pattern and _is_rig_json(path):
-        return _choose(read_rig(path), image_sizes, pattern)
-    found = _read_foreign(root, pattern, list(image_sizes))
+    if factor_m is None:
+        unit = found.unit
+        if unit is None:
+            raise CalibrationError(
+                f"{pattern}: {found.format} does not say the unit of its lengths; name it: one of "
+                f"{', '.join(UNITS_M)}"
+            )
+        factor_m = _metres(unit, None)
     cameras = []
     for name, size_px in image_sizes.items():
-        foreign = found[_pick([(c.name, c.cam_from_world) for c in found], name, pattern)]
+        foreign = _foreign(found, name, pattern)
         if foreign.size_px is not None:
             _check_size(foreign.size_px, size_px, name, pattern)
         params = foreign.params.copy()
-        start = 1 if _has_one_focal_length(foreign.model) else 2
+        start = principal_point_index(foreign.model)
         params[start : start + 2] += 0.5 - pixel_centre
         pose = foreign.cam_from_world.copy()
         pose[:, 3] *= factor_m
+        width_px, height_px = (int(extent) for extent in size_px)
         try:
-            cameras.append(
-                Camera(
-                    name,
-                    foreign.model,
-                    int(size_px[0]),
-                    int(size_px[1]),
-                    params,
-                    pose,
-                    foreign.skew_px,
-                )
-            )
+            camera = Camera(name, foreign.model, width_px, height_px, params, pose, foreign.skew_px)
         except CalibrationError as error:
             raise CalibrationError(f"{pattern}: {error}") from error
+        cameras.append(camera)
     provenance = {
         "method": "imported",
         "file": pattern,
+        "format": found.format,
         "unit": unit,
         "pixel_centre": pixel_centre,
-    } | ({"square_m": square_m} if unit == "squares" else {})
+    }
     return Rig(tuple(cameras), provenance)
 
 
-def _choose(rig: Rig, image_sizes: dict[str, tuple[int, int]], pattern: str) -> Rig:
+def _choose(rig: Rig, image_sizes: Mapping[str, tuple[int, int]], pattern: str) -> Rig:
     """Return the cameras asked for of a rig of ours, under the names asked for."""
-    known = [(camera.name, camera.cam_from_world) for camera in rig.cameras]
-    names = {rig.cameras[_pick(known, name, pattern)].name: name for name in image_sizes}
+    names = {rig.cameras[_pick(rig.cameras, name, pattern)].name: name for name in image_sizes}
     rig = rig.only(list(names))
     for camera in rig.cameras:
-        _check_size(
-            (camera.width_px, camera.height_px),
-            image_sizes[names[camera.name]],
-            names[camera.name],
-            pattern,
-        )
+        size_px = (camera.width_px, camera.height_px)
+        _check_size(size_px, image_sizes[names[camera.name]], names[camera.name], pattern)
     covariance = rig.covariance
     if covariance is not None:
         parts = [label.rpartition(" ") for label in covariance.labels]
@@ -356,52 +584,61 @@ def _metres(unit: str, square_m: float | None) -> float:
     return UNITS_M[unit]
 
 
-def _has_one_focal_length(model: str) -> bool:
-    return model.startswith("SIMPLE_") or model in {"RADIAL", "RADIAL_FISHEYE"}
+def _foreign(found: ForeignRig, name: str, pattern: str) -> ForeignCamera:
+    if found.incomplete and name in found.incomplete:
+        raise CalibrationError(
+            f"{pattern}: camera {name!r} has no {found.incomplete[name]}; calibrate it"
+        )
+    return found.cameras[_pick(found.cameras, name, pattern)]
 
 
-def _is_rig_json(path: Path) -> bool:
-    if not path.is_file():
-        raise CalibrationError(f"{path}: there is no such rig file")
-    return f'"{FORMAT}"' in path.read_text(encoding="utf-8", errors="replace")[:2000]
-
-
-def _pick(known: Sequence[tuple[str, Pose]], name: str, pattern: str) -> int:
-    """Return which of the cameras (name, cam_from_world) is the one called `name`."""
+def _pick(cameras: Sequence[Camera | ForeignCamera], name: str, pattern: str) -> int:
+    """Return which of the cameras is the one called `name`."""
+    names = [camera.name for camera in cameras]
+    others = [c.other_names if isinstance(c, ForeignCamera) else () for c in cameras]
     for matches in (
-        [i for i, (found, _) in enumerate(known) if found == name],
-        [i for i, (found, _) in enumerate(known) if Path(found).stem == name],
-        [i for i, (found, _) in enumerate(known) if found.split("/")[0] == name],
+        [i for i, found in enumerate(names) if found == name],
+        [i for i, found in enumerate(others) if name in found],
+        [i for i, found in enumerate(names) if Path(found).stem == name],
+        [i for i, found in enumerate(names) if found.split("/")[0] == name],
     ):
         if len(matches) == 1:
             return matches[0]
         if matches:
-            poses = [known[i][1] for i in matches]
+            poses = [cameras[i].cam_from_world for i in matches]
             if all(np.allclose(pose, poses[0], atol=1e-9) for pose in poses):
                 return matches[0]
             raise CalibrationError(f"{pattern}: camera {name!r} stands there {len(matches)} times")
-    names = ", ".join(found for found, _ in known)
-    raise CalibrationError(f"{pattern}: there is no camera {name!r}; it has {names}")
+    raise CalibrationError(f"{pattern}: there is no camera {name!r}; it has {', '.join(names)}")
 
 
-def _read_foreign(root: Path, pattern: str, names: list[str]) -> list[_Foreign]:
-    if "{camera}" in pattern:
-        cameras = []
-        for name in names:
-            path = root / pattern.replace("{camera}", name)
-            if not path.is_file():
-                raise CalibrationError(
-                    f"{path}: there is no such file; the rig {pattern!r} needs one for "
-                    f"camera {name!r}"
-                )
-            found = _read_file(path, [name])
-            if len(found) != 1:
-                raise CalibrationError(
-                    f"{path}: holds {len(found)} cameras, expected one, that of camera {name!r}"
-                )
-            cameras.append(replace(found[0], name=name))
-        return cameras
+def _names_on_disk(source: Path) -> list[str]:
+    """Return the names that the placeholder stands for, of the files there are, as people sort."""
+    before, _, after = str(source).partition(PLACEHOLDER)
+    folder = Path(before if before.endswith("/") else before.rpartition("/")[0] or ".")
+    prefix = "" if before.endswith("/") else before.rpartition("/")[2]
+    inside, _, rest = after.partition("/")
+    names = []
+    for entry in folder.iterdir() if folder.is_dir() else ():
+        if not (entry.name.startswith(prefix) and entry.name.endswith(inside)):
+            continue
+        name = entry.name[len(prefix) : len(entry.name) - len(inside)]
+        path = entry / rest.replace(PLACEHOLDER, name) if rest else entry
+        if name and path.is_file():
+            names.append(name)
+    if not names:
+        raise CalibrationError(f"{source}: there is no such file for any camera")
+    return sorted(
+        names,
+        key=lambda name: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", name)],
+    )
+
+
+def _read(root: Path, pattern: str, names: list[str]) -> ForeignRig | Rig:
+    """Read a rig, ours or a foreign one; `names` are the cameras wanted, where they are known."""
     path = root / pattern
+    if PLACEHOLDER in pattern:
+        return _read_one_a_camera(root, pattern, names)
     if path.is_dir():
         return _read_colmap_folder(path)
     if not path.is_file():
@@ -409,290 +646,56 @@ def _read_foreign(root: Path, pattern: str, names: list[str]) -> list[_Foreign]:
     return _read_file(path, names)
 
 
-def _read_file(path: Path, names: list[str]) -> list[_Foreign]:
-    if path.suffix.lower() in {".xml", ".yml", ".yaml", ".json"}:
-        return _read_opencv(path, names)
-    return _read_rows(path)
-
-
-# --- Rows of numbers ------------------------------------------------------------------------
-
-
-def _read_rows(path: Path) -> list[_Foreign]:
-    """Read lines ``name p11 ... p34`` or ``name K(9) R(9) t(3)``, by commas or blanks."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot be read as text ({error})") from error
-    cameras: list[_Foreign] = []
-    for number, line in enumerate(lines, start=1):
-        words = line.replace(",", " ").replace(";", " ").split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) == 1 and words[0].isdigit() and not cameras:
-            continue  # Middlebury's count of the lines that follow
-        try:
-            numbers = np.array([float(word) for word in words[1:]])
-        except ValueError:
-            if not cameras and number == 1:
-                continue  # a header
+def _read_one_a_camera(root: Path, pattern: str, names: list[str]) -> ForeignRig:
+    cameras = []
+    rig: ForeignRig | Rig | None = None
+    for name in names:
+        path = root / pattern.replace(PLACEHOLDER, name)
+        if not path.is_file():
             raise CalibrationError(
-                f"{path}, line {number}: not a name and numbers: {line.strip()[:60]!r}"
-            ) from None
-        if len(numbers) not in (12, 21) or not np.isfinite(numbers).all():
-            raise CalibrationError(
-                f"{path}, line {number}: {len(numbers)} numbers after the name {words[0]!r}, "
-                "expected 12 (a 3x4 matrix) or 21 (K, R and t)"
+                f"{path}: there is no such file; the rig {pattern!r} needs one for camera {name!r}"
             )
-        where = f"{path}, line {number}"
-        if len(numbers) == 12:
-            img_from_world = numbers.reshape(3, 4)
-        else:
-            rotation = _rotation(numbers[9:18].reshape(3, 3), where)
-            matrix = numbers[:9].reshape(3, 3)
-            img_from_world = matrix @ np.column_stack([rotation, numbers[18:]])
-        cameras.append(_decompose(words[0], img_from_world, where))
-    if not cameras:
-        raise CalibrationError(
-            f"{path}: holds no camera; expected lines of a name and 12 numbers (a 3x4 matrix), "
-            "or 21 (K, R and t)"
-        )
-    return cameras
-
-
-def _decompose(name: str, img_from_world: NDArray[np.float64], where: str) -> _Foreign:
-    """Split a projection matrix (3, 4) into lens and pose without loss.
-
-    A projection matrix is known up to a factor, which may be negative. It is chosen so that
-    depths are positive in front of the camera: its left part has a positive determinant if the
-    image is not mirrored.
-
-    References
-    ----------
-    Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., 2003, sections 6.2.3 and 6.2.4.
-    """
-    left = img_from_world[:, :3]
-    scale = float(np.linalg.norm(left[2]))
-    determinant = float(np.linalg.det(left / max(scale, 1e-300)))
-    if scale == 0 or abs(determinant) < 1e-9 * float(np.abs(left).max() / scale) ** 2:
-        raise CalibrationError(
-            f"{where}: the matrix of camera {name!r} is singular; expected K [R | t]"
-        )
-    sign = np.sign(determinant)
-    # RQ from QR: reverse the rows, transpose.
-    flip = np.eye(3)[::-1]
-    q, r = np.linalg.qr((flip @ (sign * left)).T)
-    upper, rotation = flip @ r.T @ flip, flip @ q.T
-    signs = np.diag(np.where(np.diag(upper) < 0, -1.0, 1.0))
-    upper, rotation = upper @ signs, signs @ rotation
-    translation = np.linalg.solve(upper, sign * img_from_world[:, 3])
-    matrix = upper / upper[2, 2]
-    skew_px = float(matrix[0, 1])
-    if abs(skew_px) < _NO_SKEW_PX:
-        skew_px = 0.0
-    return _Foreign(
-        name,
-        "PINHOLE",
-        np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]),
-        np.column_stack([rotation, translation]),
-        skew_px,
-    )
-
-
-def _rotation(matrix: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Return a (3, 3) rotation freed of rounding."""
-    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if not error < _ROUNDED_ROTATION or np.linalg.det(matrix) < 0:
-        raise CalibrationError(
-            f"{where}: the rotation is none (R R' is off by {error:.0e}); check the order of its "
-            "entries"
-        )
-    u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ vt)
-
-
-# --- OpenCV ---------------------------------------------------------------------------------
-
-
-def _read_opencv(path: Path, names: list[str]) -> list[_Foreign]:
-    entries = _opencv_entries(path)
-    if "m1" in entries and "m2" in entries:
-        return _stereo_pair(path, entries, names)
-    if len(names) != 1:
-        raise CalibrationError(
-            f"{path}: an OpenCV file holds one camera, expected {len(names)}; write the rig as "
-            "one file a camera, with {camera} in its path"
-        )
-
-    def find(what: str) -> Any:
-        return next((entries[key] for key in _OPENCV_KEYS[what] if key in entries), None)
-
-    def need(what: str) -> NDArray[np.float64]:
-        value = find(what)
-        if not isinstance(value, np.ndarray):
+        rig = _read_file(path, [name])
+        if isinstance(rig, Rig):
+            raise CalibrationError(f"{path}: is a rig.json, which holds all cameras; name it alone")
+        if len(rig.cameras) != 1:
             raise CalibrationError(
-                f"{path}: holds no {what} (known keys: {', '.join(_OPENCV_KEYS[what])}); it has "
-                f"{', '.join(entries) or 'nothing'}"
+                f"{path}: holds {len(rig.cameras)} cameras, expected one, that of camera {name!r}"
             )
-        return value
-
-    pose = find("pose")
-    if isinstance(pose, np.ndarray) and pose.shape in ((3, 4), (4, 4)):
-        rotation, translation = pose[:3, :3], pose[:3, 3]
-    else:
-        rotation, translation = need("rotation"), need("translation").ravel()
-    distortion = find("distortion")
-    model = find("model")
-    width, height = find("width"), find("height")
-    size_px = None
-    if isinstance(width, float) and isinstance(height, float):
-        size_px = (int(width), int(height))
-    return [
-        _opencv_camera(
-            names[0],
-            need("matrix"),
-            distortion if isinstance(distortion, np.ndarray) else np.zeros(0),
-            rotation,
-            translation,
-            isinstance(model, str) and model.lower() in {"fisheye", "equidistant"},
-            size_px,
-            str(path),
-        )
-    ]
+        cameras.append(replace(rig.cameras[0], name=name, other_names=()))
+    if not isinstance(rig, ForeignRig):
+        raise CalibrationError(f"{pattern}: no camera is asked for; name at least one")
+    return replace(rig, cameras=tuple(cameras))
 
 
-def _opencv_entries(path: Path) -> dict[str, Any]:
-    """Return the matrices, numbers and texts of an OpenCV file, by simplified key."""
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        is_open = storage.isOpened()
-    except (cv2.error, SystemError):
-        is_open = False
-    if not is_open:
-        raise CalibrationError(
-            f"{path}: not an OpenCV file; expected XML, YAML or JSON as cv::FileStorage writes it"
-        )
-    try:
-        root = storage.root()
-        entries: dict[str, Any] = {}
-        for key in root.keys():  # noqa: SIM118 - not a dict
-            simple = key.lower().replace("_", "").replace("-", "").replace(" ", "")
-            entries[simple] = _opencv_value(root.getNode(key))
-        return entries
-    finally:
-        storage.release()
-
-
-def _opencv_value(node: Any) -> Any:
-    if node.isInt() or node.isReal():
-        return float(node.real())
-    if node.isString():
-        return node.string()
-    if node.isSeq():
-        values = [_opencv_value(node.at(index)) for index in range(node.size())]
+def _read_file(path: Path, names: list[str]) -> ForeignRig | Rig:
+    """Read one file, recognised by what stands in it."""
+    text = read_text(path)
+    start = text.lstrip()
+    is_opencv = path.suffix.lower() in opencv.SUFFIXES or start.startswith("%YAML")
+    if start.startswith("{"):
+        if f'"{FORMAT}"' in start[:2000]:
+            return read_rig(path)
         try:
-            return np.array(values, dtype=np.float64)
-        except (TypeError, ValueError):
-            return None
-    if node.isMap():
-        try:
-            matrix = node.mat()
-        except cv2.error:
-            matrix = None
-        if matrix is not None:
-            return np.asarray(matrix, dtype=np.float64)
-        data = node.getNode("data")  # ROS writes rows, cols and data
-        if data.isSeq():
-            values = _opencv_value(data)
-            rows, columns = node.getNode("rows"), node.getNode("cols")
-            if isinstance(values, np.ndarray) and rows.isInt() and columns.isInt():
-                return values.reshape(int(rows.real()), int(columns.real()))
-    return None
+            content = json.loads(text)
+        except ValueError as error:
+            raise CalibrationError(f"{path}: not JSON ({error})") from error
+        if multical.is_multical(content):
+            return multical.read_multical(path)
+        is_opencv = True
+    elif start.startswith("<"):
+        is_opencv = True
+    elif kalibr.is_chain(text):
+        return kalibr.read_chain(path)
+    elif caliscope.is_camera_toml(text) or path.suffix.lower() == ".toml":
+        return caliscope.read_camera_toml(path)
+    return opencv.read_opencv(path, names or [path.stem]) if is_opencv else rows.read_rows(path)
 
 
-def _opencv_camera(
-    name: str,
-    matrix: NDArray[np.float64],
-    distortion: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    is_fisheye: bool,
-    size_px: tuple[int, int] | None,
-    where: str,
-) -> _Foreign:
-    if matrix.shape != (3, 3) or translation.shape != (3,):
-        raise CalibrationError(
-            f"{where}: camera matrix of shape {matrix.shape} and translation of {translation.shape}"
-            ", expected (3, 3) and (3,)"
-        )
-    if rotation.size == 3:
-        rotation = np.asarray(cv2.Rodrigues(rotation.astype(np.float64).ravel())[0])
-    if rotation.shape != (3, 3):
-        raise CalibrationError(
-            f"{where}: rotation of shape {rotation.shape}, expected 3 numbers or (3, 3)"
-        )
-    pose = np.column_stack([_rotation(rotation, where), translation])
-    matrix = matrix / matrix[2, 2]
-    lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    coefficients = np.zeros(14)
-    given = distortion.ravel()
-    if len(given) > 14:
-        raise CalibrationError(f"{where}: {len(given)} distortion coefficients, expected up to 14")
-    coefficients[: len(given)] = given
-    k1, k2, p1, p2, k3 = coefficients[:5]
-    if is_fisheye:
-        return _Foreign(
-            name, "OPENCV_FISHEYE", np.array([*lens, *coefficients[:4]]), pose, 0.0, size_px
-        )
-    if coefficients[8:].any():
-        raise CalibrationError(
-            f"{where}: thin prism and tilt distortion ({len(given)} coefficients) is no COLMAP "
-            "model; calibrate without it"
-        )
-    if coefficients[4:8].any():
-        params = np.array([*lens, k1, k2, p1, p2, k3, *coefficients[5:8]])
-        return _Foreign(name, "FULL_OPENCV", params, pose, 0.0, size_px)
-    if coefficients[:4].any():
-        return _Foreign(name, "OPENCV", np.array([*lens, k1, k2, p1, p2]), pose, 0.0, size_px)
-    return _Foreign(name, "PINHOLE", np.array(lens), pose, float(matrix[0, 1]), size_px)
-
-
-def _stereo_pair(path: Path, entries: dict[str, Any], names: list[str]) -> list[_Foreign]:
-    """Read M1, D1, M2, D2, with R and T here or in ``extrinsics.*`` beside (OpenCV's sample)."""
-    if len(names) != 2:
-        raise CalibrationError(f"{path}: holds a stereo pair, expected {len(names)} cameras")
-    beside = path.with_name("extrinsics" + path.suffix)
-    if "r" not in entries and beside.is_file():
-        entries = _opencv_entries(beside) | entries
-    if not all(isinstance(entries.get(key), np.ndarray) for key in ("d1", "d2", "r", "t")):
-        raise CalibrationError(
-            f"{path}: a stereo pair needs M1, D1, M2, D2, and R and T here or in {beside.name}"
-        )
-    poses = [(np.eye(3), np.zeros(3)), (entries["r"], entries["t"].ravel())]
-    return [
-        _opencv_camera(
-            name,
-            entries[f"m{number}"],
-            entries[f"d{number}"],
-            rotation,
-            translation,
-            False,
-            None,
-            str(path),
-        )
-        for number, (name, (rotation, translation)) in enumerate(
-            zip(names, poses, strict=True), start=1
-        )
-    ]
-
-
-# --- COLMAP ---------------------------------------------------------------------------------
-
-
-def _read_colmap_folder(folder: Path) -> list[_Foreign]:
+def _read_colmap_folder(folder: Path) -> ForeignRig:
     """Read the cameras of a COLMAP model, binary or text."""
-    return [
-        _Foreign(
+    cameras = tuple(
+        ForeignCamera(
             camera.name,
             camera.model,
             camera.params,
@@ -701,4 +704,5 @@ def _read_colmap_folder(folder: Path) -> list[_Foreign]:
             (camera.width_px, camera.height_px),
         )
         for camera in read_colmap_model(folder).cameras
-    ]
+    )
+    return ForeignRig("colmap", cameras, pixel_centre=0.5, is_centre_fixed=True)

@@ -9,6 +9,7 @@ import click
 
 from hybridve.calib.errors import HybridveError
 from hybridve.cli.calibrate import calibrate
+from hybridve.cli.convert import convert
 from hybridve.cli.demo import demo
 from hybridve.cli.detect import detect
 from hybridve.cli.doctor import doctor
@@ -55,7 +56,10 @@ def cli(verbose: int, quiet: bool) -> None:
     )
 
 
-for command in (demo, synth, calibrate, segment, detect, spacing, sweep, summary, render, doctor):
+for command in (
+    *(demo, synth, calibrate, convert, segment, detect),
+    *(spacing, sweep, summary, render, doctor),
+):
     cli.add_command(command)
 
 for command in (cli, *cli.commands.values()):

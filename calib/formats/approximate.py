@@ -1,0 +1,133 @@
+"""A lens in another lens model, as near as it comes, where a format does not have the lens's own.
+
+The largest error over the image is found on rays beside those of the fit, and is to be told.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.camera import N_PARAMS, Camera
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.lens import cam_from_img, img_from_cam
+
+#: Rays per side of the image: of the fit, and, between those, of the error.
+_FIT_STEPS = 24
+_CHECK_STEPS = 55
+
+#: A pixel shows a ray only if that ray leads back to the pixel, this near.
+_FOLD_TOLERANCE_PX = 1e-3
+
+#: Rounds of the damped least squares, and when they end: relative gain of the sum of squares.
+_ROUNDS = 200
+_ENOUGH_GAIN = 1e-12
+
+#: Relative step of the derivatives.
+_STEP = 1e-6
+
+
+def approximate(camera: Camera, models: Sequence[tuple[str, int]]) -> tuple[Camera, float]:
+    """Return a camera with the nearest lens of some models, and its largest error.
+
+    Parameters
+    ----------
+    camera : Camera
+        Name, size and pose stay.
+    models : sequence of (str, int)
+        COLMAP models whose parameters start fx, fy, cx, cy, each with how many of its first
+        parameters may differ from 0.
+
+    Returns
+    -------
+    approximation : Camera
+        Of the model that comes nearest.
+    error_px : float
+        The largest distance between the images of a ray, over all that the image shows.
+
+    Raises
+    ------
+    CalibrationError
+        If the image shows no ray at all, or no model comes near.
+    """
+    rays, pixels = _shown(camera, _FIT_STEPS)
+    check_rays, check_pixels = _shown(camera, _CHECK_STEPS)
+    best: tuple[Camera, float] | None = None
+    for model, n_free in models:
+        candidate = _fit(camera, model, n_free, rays, pixels)
+        errors = np.linalg.norm(img_from_cam(candidate, check_rays) - check_pixels, axis=1)
+        error_px = float(errors.max()) if np.isfinite(errors).all() else float("inf")
+        if best is None or error_px < best[1]:
+            best = candidate, error_px
+    if best is None:
+        raise ValueError("approximate needs at least one model")
+    if not np.isfinite(best[1]):
+        raise CalibrationError(f"camera {camera.name!r}: no other lens comes near its own")
+    return best
+
+
+def _shown(camera: Camera, steps: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rays (N, 3) in front of the camera and the pixels (N, 2) of a grid that shows them."""
+    xs = np.linspace(0.0, camera.width_px, steps)
+    ys = np.linspace(0.0, camera.height_px, steps)
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([cam_from_img(camera, grid), np.ones(len(grid))])
+    exists = np.isfinite(rays).all(axis=1)
+    again = np.full_like(grid, np.inf)
+    again[exists] = img_from_cam(camera, rays[exists])
+    exists &= np.linalg.norm(np.nan_to_num(again, nan=np.inf) - grid, axis=1) < _FOLD_TOLERANCE_PX
+    if not exists.any():
+        raise CalibrationError(f"camera {camera.name!r}: its lens shows nothing anywhere")
+    return rays[exists], grid[exists]
+
+
+def _fit(
+    camera: Camera,
+    model: str,
+    n_free: int,
+    rays: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+) -> Camera:
+    """Return the camera with the lens of a model that images rays nearest to their pixels."""
+    matrix = camera.pinhole
+
+    def with_free(free: NDArray[np.float64]) -> Camera:
+        params = np.zeros(N_PARAMS[model])
+        params[:n_free] = free
+        return replace(camera, model=model, params=params, skew_px=0.0)
+
+    def residuals(free: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = img_from_cam(with_free(free), rays) - pixels
+        return np.nan_to_num(found, nan=1e6, posinf=1e6, neginf=-1e6).ravel()
+
+    free = np.zeros(n_free)
+    free[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    errors = residuals(free)
+    damping = 1e-3
+    for _ in range(_ROUNDS):
+        steps = _STEP * np.maximum(np.abs(free), 1.0)
+        jacobian = np.stack(
+            [
+                (residuals(free + step) - residuals(free - step)) / (2.0 * step.max())
+                for step in np.diag(steps)
+            ],
+            axis=1,
+        )
+        # Marquardt's scaling: pixels and coefficients differ by many orders of magnitude.
+        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
+        damped = np.vstack([jacobian / scale, np.sqrt(damping) * np.eye(n_free)])
+        target = np.concatenate([-errors, np.zeros(n_free)])
+        step = np.linalg.lstsq(damped, target, rcond=None)[0] / scale
+        tried = residuals(free + step)
+        gain = float(errors @ errors - tried @ tried)
+        if gain > 0:
+            is_enough = gain < _ENOUGH_GAIN * float(errors @ errors)
+            free, errors, damping = free + step, tried, damping / 5.0
+            if is_enough:
+                break
+        elif damping > 1e12:
+            break
+        else:
+            damping *= 5.0
+    return with_free(free)
