@@ -408,6 +408,7 @@ def adjust_lens(
     loss_px: float,
     free: NDArray[np.bool_],
     move_poses: bool = True,
+    max_steps: int = _MAX_STEPS,
 ) -> LensAdjustment:
     """Adjust a lens and the poses of its views to the robust least squares (soft L1).
 
@@ -425,13 +426,15 @@ def adjust_lens(
         Which parameters of the lens move.
     move_poses : bool
         Whether the poses do.
+    max_steps : int
+        After so many steps the result stands as it is.
     """
     mask = are_finite(batch_residuals(camera, poses, batch))
     batch = batch.only(mask)
     cost = _cost(camera, poses, batch, mask, loss_px)
     damping = _FIRST_DAMPING
     normal = _normal_equations(camera, poses, batch, mask, loss_px, free, move_poses)
-    for _ in range(_MAX_STEPS):
+    for _ in range(max_steps):
         of_lens, of_poses = _step(normal, damping)
         params = camera.params + of_lens
         moved_cost = np.inf
@@ -951,7 +954,7 @@ def fit_batch(
         if is_rough:
             is_rough = False
             continue
-        noise_px = _noise(batch_residuals(lens, adjusted.poses, part), int(every.sum()))
+        noise_px = noise_of(batch_residuals(lens, adjusted.poses, part), int(every.sum()))
         others = np.setdiff1d(np.arange(n_views), used)
         located = _locate_robustly(lens, batch.of(others), noise_px)
         poses[others] = np.where(np.isfinite(located), located, poses[others])
@@ -1012,7 +1015,7 @@ def _locate_robustly(lens: Camera, batch: Batch, noise_px: float) -> NDArray[np.
     return np.where(better[:, None, None], again, poses)
 
 
-def _noise(residuals: NDArray[np.float64], n_params: int) -> float:
+def noise_of(residuals: NDArray[np.float64], n_params: int) -> float:
     """Return the standard deviation of a coordinate from residuals (V, N, 2), robustly."""
     values = residuals[np.isfinite(residuals)]
     if not len(values):
