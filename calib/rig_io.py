@@ -451,12 +451,14 @@ def _lost(rig: Rig, to: str) -> Iterable[str]:
         yield "the image sizes"
     if to == "kalibr":
         yield f"the world: it is the frame of {names[0]!r} now"
-        pairs = ", ".join(f"cam{number} is {name!r}" for number, name in enumerate(names))
-        yield f"the cameras' names, but for the topics: {pairs}"
-    if to == "caliscope":
-        ids = caliscope.camera_ids(names)
-        pairs = ", ".join(f"{i} is {name!r}" for i, name in zip(ids, names, strict=True))
-        yield f"the cameras' names: {pairs}"
+        numbered = [f"cam{number}" for number in range(len(names))]
+    elif to == "caliscope":
+        numbered = [f"{number}" for number in caliscope.camera_ids(names)]
+    else:
+        numbered = names
+    if numbered != names:
+        pairs = (f"{number} is {name!r}" for number, name in zip(numbered, names, strict=True))
+        yield f"the cameras' names, which {to} passes over: {', '.join(pairs)}"
     if rig.covariance is not None:
         yield "the covariance"
     if rig.mounts:

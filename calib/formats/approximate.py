@@ -14,15 +14,17 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import cam_from_img, img_from_cam
 
 #: Rays per side of the image: of the fit, and, between those, of the error.
-_FIT_STEPS = 24
+_FIT_STEPS = 20
 _CHECK_STEPS = 55
 
 #: A pixel shows a ray only if that ray leads back to the pixel, this near.
 _FOLD_TOLERANCE_PX = 1e-3
 
-#: Rounds of the damped least squares, and when they end: relative gain of the sum of squares.
-_ROUNDS = 200
-_ENOUGH_GAIN = 1e-12
+#: Rounds of the damped least squares, and when they end: relative gain of the sum of squares, or
+#: an error that nobody can see.
+_ROUNDS = 100
+_ENOUGH_GAIN = 1e-5
+_ENOUGH_PX = 1e-6
 
 #: Relative step of the derivatives.
 _STEP = 1e-6
@@ -124,7 +126,7 @@ def _fit(
         if gain > 0:
             is_enough = gain < _ENOUGH_GAIN * float(errors @ errors)
             free, errors, damping = free + step, tried, damping / 5.0
-            if is_enough:
+            if is_enough or np.abs(errors).max() < _ENOUGH_PX:
                 break
         elif damping > 1e12:
             break

@@ -6,7 +6,8 @@ world to camera; old Caliscope files: 3x3) and ``translation``, and ``fisheye = 
 lens is one. Caliscope names its sections ``[cameras.N]``, with ``cam_id = N`` (``[cam_N]`` and
 ``port`` in its older config.toml), and is in metres. aniposelib names them ``[cam_N]`` with a
 ``name``, beside ``[metadata]``, in the unit of its board, which the file does not say; what is
-written here says it in the metadata.
+written here says it in the metadata. Caliscope knows cameras by number; it passes over the ``name``
+that is written here too.
 
 References
 ----------
@@ -69,7 +70,7 @@ def write_caliscope(cameras: Sequence[Camera]) -> str:
     """Return the text of a camera_array.toml, in metres."""
     sections = []
     for number, camera in zip(camera_ids([c.name for c in cameras]), cameras, strict=True):
-        lines = [f"[cameras.{number}]", f"cam_id = {number}", "rotation_count = 0"]
+        lines = [f"[cameras.{number}]", f"cam_id = {number}", f"name = {_quoted(camera.name)}"]
         sections.append("\n".join([*lines, *_lines(camera, 1.0), f"fisheye = {_fisheye(camera)}"]))
     return "\n\n".join(sections) + "\n"
 

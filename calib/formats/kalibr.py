@@ -10,8 +10,9 @@ Cameras are ``cam0``, ``cam1``, ... with ``camera_model`` and ``intrinsics``:
 * ds (double sphere): no COLMAP model.
 
 ``T_cn_cnm1`` (4x4) maps from the camera before in the chain, metres. Kalibr has no world: cam0's
-frame is the world, unless cam0 has a ``T_cn_cnm1`` too, as mrcal writes it. The centre of the
-top-left pixel is at 0, as its detectors have it.
+frame is the world, unless cam0 has a ``T_cn_cnm1`` too, as mrcal writes it. Cameras are called
+after their topics, where these are all ``/NAME/image_raw``. The centre of the top-left pixel is at
+0, as Kalibr's detectors have it.
 
 References
 ----------
@@ -57,6 +58,9 @@ _NEEDED = ("camera_model", "intrinsics", "distortion_model", "distortion_coeffs"
 
 _CHAIN = re.compile(r"^cam\d+\s*:", re.MULTILINE)
 
+#: A topic that says its camera's name.
+_TOPIC = re.compile(r"/([^/]+)/image_raw")
+
 #: Models that a chain holds besides those that opencv_lens turns into radtan or equidistant.
 _OWN_MODELS = ("EUCM", "FOV")
 
@@ -76,7 +80,7 @@ def refusal(camera: Camera) -> str | None:
     if camera.skew_px:
         return f"a skew of {camera.skew_px:.3g} px"
     if camera.model not in _OPENCV_MODELS + _OWN_MODELS:
-        return f"the lens model {camera.model}; it has radtan, equidistant, fov and eucm"
+        return f"the lens model {camera.model}; Kalibr has radtan, equidistant, fov and eucm"
     if camera.model == "FULL_OPENCV" and camera.params[8:].any():
         return "more than radtan's k1, k2, p1, p2"
     return None
@@ -147,6 +151,7 @@ def read_chain(path: Path) -> ForeignRig:
     if not names or names != [f"cam{number}" for number in range(len(names))]:
         found = ", ".join(str(key) for key in entries) or "nothing"
         raise CalibrationError(f"{path}: expected cameras cam0, cam1, ..., found {found}")
+    called = _topic_names([entries[name] for name in names]) or names
     cameras: list[ForeignCamera] = []
     cam_from_world: Pose = np.eye(3, 4)
     for number, name in enumerate(names):
@@ -164,18 +169,26 @@ def read_chain(path: Path) -> ForeignRig:
         elif number > 0:
             raise CalibrationError(f"{where}: has no T_cn_cnm1; calibrate the cameras together")
         model, params = _colmap_lens(entry, where)
-        topic = str(entry.get("rostopic", ""))
+        size_px = as_size(entry["resolution"], where)
         cameras.append(
             ForeignCamera(
-                name,
+                called[number],
                 model,
                 params,
                 cam_from_world,
-                size_px=as_size(entry["resolution"], where),
-                other_names=(topic, topic.strip("/").removesuffix("/image_raw")),
+                size_px=size_px,
+                other_names=(name, str(entry.get("rostopic", ""))),
             )
         )
     return ForeignRig("kalibr", tuple(cameras), pixel_centre=0.0, is_centre_fixed=True, unit="m")
+
+
+def _topic_names(entries: Sequence[Any]) -> list[str] | None:
+    """Return the names in topics "/NAME/image_raw", or None unless each camera has its own."""
+    topics = (entry.get("rostopic") if isinstance(entry, dict) else None for entry in entries)
+    found = [_TOPIC.fullmatch(topic) if isinstance(topic, str) else None for topic in topics]
+    names = [match.group(1) for match in found if match is not None]
+    return names if len(set(names)) == len(entries) else None
 
 
 def _colmap_lens(entry: dict[str, Any], where: str) -> tuple[str, NDArray[np.float64]]:
