@@ -1,0 +1,702 @@
+"""By how much cameras are out of time, told by a board that moves before them.
+
+A camera's *offset* is how many frames late its clock is: its frame k was recorded when the
+session's frame ``k + offset`` was. (A session's ``offset_s`` is the same in seconds.) The clock of
+the first camera, by name, is the session's.
+
+Whole frames are found by trying them: with the right one, two cameras have the same relative pose
+at all instants. Fractions follow from a least-squares fit of the offsets, the cameras' poses and
+the board's pose at each instant: the corners that a camera saw at the session's instants are
+interpolated on their tracks, by cubics through four frames, and moved as the offsets change. Only
+where the board moves does a frame's place in time show; constant speed in one direction looks like
+another place of the camera, and shows nothing either. What cannot be told is NaN.
+
+This work is based on: Albl, Kukelova, Fitzgibbon, Heller, Smid and Pajdla, *On the two-view
+geometry of unsynchronized cameras*, CVPR 2017 (image tracks linearised in time); Rehder, Siegwart
+and Furgale, *A general approach to spatiotemporal calibration in multisensor systems*, IEEE Trans.
+Robotics 32(2), 2016 (the offset as one more parameter of the adjustment).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.board import Board, Observations, Sighting, is_seen
+from hybridve.calib.camera import Camera
+from hybridve.calib.consensus import CommonPose, common_pose, pose_distances
+from hybridve.calib.image_io import natural_order
+from hybridve.calib.lens import cam_from_img
+from hybridve.calib.lens_fit import locate_board
+from hybridve.calib.pose import Pose, compose, invert
+
+#: Offsets tried, and common instants from which each is judged.
+_MAX_OFFSET_FRAMES = 25
+_JUDGED = 40
+_MIN_COMMON = 6
+
+#: Common views that differ by more than this (radians plus shares of distance) are not in time at
+#: all, or not of one board.
+_DISAGREE = 0.2
+
+#: Instants adjusted together at most.
+_MAX_INSTANTS = 80
+
+#: Steps of the adjustment; it has converged when no offset moves further (frames).
+_MAX_STEPS = 30
+_CONVERGED_FRAMES = 1e-8
+
+#: Residuals beyond this many robust standard deviations weigh less than squared.
+_LOSS_SIGMAS = 3.0
+
+#: The least share of the corners' speed (mean square) that must be motion rather than noise, and
+#: the largest standard deviation of an offset that counts as known, frames.
+_MIN_MOTION = 0.75
+_KNOWN_FRAMES = 0.25
+
+
+class SolvedLens(Protocol):
+    """What is needed of a lens that was fitted to the views of one camera."""
+
+    @property
+    def camera(self) -> Camera:
+        """The lens; its pose is not used."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clocks:
+    """How late the cameras are.
+
+    Attributes
+    ----------
+    reference : str
+        The camera whose clock is the session's.
+    offset_frames : dict of str to float
+        By camera: its frame k was recorded at the session's frame ``k + offset``. NaN: unknown.
+    std_frames : dict of str to float
+        Standard deviations; 0 for the reference, NaN where the offset is unknown.
+    is_known : dict of str to bool
+        Whether the offset is known to a quarter of a frame.
+    rms_px : float
+        Of the corners that the offsets were fitted to; NaN where none were.
+    notes : tuple of str
+        Why an offset is not known.
+    """
+
+    reference: str
+    offset_frames: dict[str, float]
+    std_frames: dict[str, float]
+    is_known: dict[str, bool]
+    rms_px: float
+    notes: tuple[str, ...] = ()
+
+
+#: By board and instant the points that a camera saw: (N, 2), pixels or rays.
+_Tracks = dict[tuple[int, int], NDArray[np.float64]]
+
+
+def estimate_offsets(
+    boards: Sequence[Board],
+    lenses: Sequence[SolvedLens],
+    observations: Sequence[Observations],
+    max_offset_frames: int = _MAX_OFFSET_FRAMES,
+) -> Clocks:
+    """Estimate how late each camera is, from a clip in which boards move before all of them.
+
+    Parameters
+    ----------
+    boards : sequence of Board
+        The boards.
+    lenses : sequence of SolvedLens
+        The lenses of the cameras.
+    observations : sequence of Observations
+        What the same cameras saw; every frame of the clip, so that neighbours can be interpolated.
+    max_offset_frames : int
+        The largest offset between two cameras that is looked for.
+    """
+    order = sorted(range(len(lenses)), key=lambda index: natural_order(observations[index].name))
+    names = [observations[index].name for index in order]
+    n_cameras = len(names)
+    offsets, stds = np.full(n_cameras, np.nan), np.full(n_cameras, np.nan)
+    offsets[0] = stds[0] = 0.0
+    notes: dict[int, str] = {}
+    rms_px = np.nan
+    if any(observations[index].is_still for index in order):
+        notes |= dict.fromkeys(range(1, n_cameras), "the boards lie still in the clip")
+    elif n_cameras > 1:
+        cameras = [lenses[index].camera for index in order]
+        tracks = [_tracks(observations[index].sightings) for index in order]
+        spacing = _spacing(tracks)
+        tracks = [_listed_alike(boards, seen, spacing) for seen in tracks]
+        poses = [_located(boards, *pair) for pair in zip(cameras, tracks, strict=True)]
+        start = _start(boards, poses, spacing, max_offset_frames)
+        for index in range(1, n_cameras):
+            if index not in start:
+                notes[index] = (
+                    "it shares no run of frames with the others in which their views of a board "
+                    "agree on where the cameras stand"
+                )
+        problem = _Problem.of(boards, cameras, tracks, poses, start, spacing)
+        if problem is None:
+            notes |= dict.fromkeys(
+                start.keys() - {0}, "too few neighbouring frames show a board to two cameras"
+            )
+        else:
+            found = problem.solve()
+            rms_px = found.rms_px
+            for index in sorted(start.keys() - {0}):
+                std = found.std_frames[index]
+                if found.motion[index] < _MIN_MOTION:
+                    notes[index] = "the board hardly moves before it"
+                elif not std < _KNOWN_FRAMES:
+                    notes[index] = (
+                        "the board's motion does not tell it: move it to and fro, and turn it"
+                    )
+                else:
+                    offsets[index], stds[index] = found.offset_frames[index], std
+    return Clocks(
+        names[0],
+        {name: float(offset) for name, offset in zip(names, offsets, strict=True)},
+        {name: float(std) for name, std in zip(names, stds, strict=True)},
+        {name: bool(np.isfinite(offset)) for name, offset in zip(names, offsets, strict=True)},
+        rms_px,
+        tuple(
+            f"camera {names[index]!r}: its offset in time cannot be told: {why}"
+            for index, why in sorted(notes.items())
+        ),
+    )
+
+
+def resampled(
+    observations: Sequence[Observations],
+    offset_frames: Mapping[str, float],
+    boards: Sequence[Board] | None = None,
+) -> list[Observations]:
+    """Return what the cameras would have seen of moving boards, had their clocks been right.
+
+    Corners are interpolated by cubics through four neighbouring frames, where these were seen;
+    other sightings in the clip are left out. Stills, still clips and cameras without offset stay.
+
+    Parameters
+    ----------
+    observations : sequence of Observations
+        What the cameras saw.
+    offset_frames : mapping of str to float
+        As `Clocks.offset_frames`; cameras that are not named, or NaN, are taken to be in time.
+    boards : sequence of Board, optional
+        The boards: where one looks the same when turned, neighbouring frames may list it from
+        different ends, and are then listed alike.
+    """
+    instants = sorted(
+        {s.instant for seen in observations for s in seen.sightings if s.instant is not None}
+    )
+    spacing = _spacing([_tracks(seen.sightings) for seen in observations])
+    found = []
+    for seen in observations:
+        offset = offset_frames.get(seen.name, 0.0)
+        if seen.is_still or not np.isfinite(offset) or offset == 0.0:
+            found.append(seen)
+            continue
+        tracks = _tracks(seen.sightings)
+        if boards is not None:
+            tracks = _listed_alike(boards, tracks, spacing)
+        stills = tuple(s for s in seen.sightings if s.instant is None)
+        moved = []
+        for instant in instants:
+            for board in sorted({board for board, _ in tracks}):
+                track = _interpolated(tracks, board, instant - offset, spacing)
+                if track is not None:
+                    image = f"board clip, instant {instant}"
+                    moved.append(Sighting(image, instant, board, track.points))
+        found.append(replace(seen, sightings=(*stills, *moved)))
+    return found
+
+
+# --- Tracks ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Interpolated:
+    """Points (N, 2) between frames, their speed a frame, and what becomes of noise in both.
+
+    Noise of variance 1 in the frames becomes `noise` in the points, `speed_noise` in the speed,
+    and makes the two covary by `common_noise`.
+    """
+
+    points: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    noise: float
+    speed_noise: float
+    common_noise: float
+
+
+def _tracks(sightings: Sequence[Sighting]) -> _Tracks:
+    """Return by board and instant what was seen in the clip."""
+    return {(s.board, s.instant): s.pixels for s in sightings if s.instant is not None}
+
+
+def _listed_alike(boards: Sequence[Board], tracks: _Tracks, spacing: int) -> _Tracks:
+    """List boards that look the same when turned from frame to frame by the same end."""
+    found: _Tracks = {}
+    for board, instant in sorted(tracks):
+        pixels, looks = tracks[board, instant], boards[board].looks
+        before = found.get((board, instant - spacing))
+        if before is not None and len(looks) > 1:
+            moved = [_mean_distance(pixels[look], before) for look in looks]
+            pixels = pixels[looks[int(np.argmin(moved))]]
+        found[board, instant] = pixels
+    return found
+
+
+def _mean_distance(pixels: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    both = is_seen(pixels) & is_seen(others)
+    if not both.any():
+        return np.inf
+    return float(np.linalg.norm(pixels[both] - others[both], axis=1).mean())
+
+
+def _spacing(tracks: Sequence[_Tracks]) -> int:
+    """Return how many frames lie between neighbouring instants."""
+    instants = sorted({instant for seen in tracks for _, instant in seen})
+    return min((b - a for a, b in pairwise(instants)), default=1)
+
+
+def _interpolated(tracks: _Tracks, board: int, time: float, spacing: int) -> _Interpolated | None:
+    """Return a board's points at a time between frames; None unless four frames around show it.
+
+    Points that are not seen in all four are NaN. At a frame itself its own points are returned.
+    """
+    phase = next((instant % spacing for b, instant in tracks if b == board), 0)
+    first = int(np.floor((time - phase) / spacing)) * spacing + phase
+    nodes = [first + step * spacing for step in (-1, 0, 1, 2)]
+    if any((board, node) not in tracks for node in nodes):
+        return None
+    weights, slopes = _cubic((time - first) / spacing)
+    frames = np.stack([tracks[board, node] for node in nodes])
+    return _Interpolated(
+        np.tensordot(weights, frames, axes=1),
+        np.tensordot(slopes, frames, axes=1) / spacing,
+        float((weights**2).sum()),
+        float((slopes**2).sum()) / spacing**2,
+        float((weights * slopes).sum()) / spacing,
+    )
+
+
+def _cubic(share: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the weights (4,) of frames at -1, 0, 1, 2 for a cubic at `share`, and of its slope."""
+    polynomials = np.array(  # Lagrange's, by powers of the share
+        [
+            [0.0, -1.0 / 3.0, 0.5, -1.0 / 6.0],
+            [1.0, -0.5, -1.0, 0.5],
+            [0.0, 1.0, 0.5, -0.5],
+            [0.0, -1.0 / 6.0, 0.0, 1.0 / 6.0],
+        ]
+    )
+    powers = share ** np.arange(4.0)
+    slopes = np.array([0.0, 1.0, 2.0 * share, 3.0 * share**2])
+    return polynomials @ powers, polynomials @ slopes
+
+
+# --- Whole frames ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """A camera's offset to whole frames, and its pose against the reference."""
+
+    offset: int
+    cam_from_rig: Pose
+
+
+def _located(
+    boards: Sequence[Board], camera: Camera, tracks: _Tracks
+) -> dict[tuple[int, int], Pose]:
+    poses = {}
+    for (board, instant), pixels in tracks.items():
+        located = locate_board(camera, boards[board].points_board, pixels)
+        if located is not None:
+            poses[board, instant] = located[0]
+    return poses
+
+
+def _start(
+    boards: Sequence[Board],
+    poses: Sequence[Mapping[tuple[int, int], Pose]],
+    spacing: int,
+    max_offset: int,
+) -> dict[int, _Start]:
+    """Return offsets and poses of the cameras that can be reached from the first one."""
+    edges: list[tuple[int, float, int, int, int, Pose]] = []
+    for one, other in combinations(range(len(poses)), 2):
+        best: tuple[float, int, int, CommonPose] | None = None
+        for late in range(-(max_offset // spacing), max_offset // spacing + 1):
+            ahead = late * spacing
+            keys = sorted(key for key in poses[one] if (key[0], key[1] - ahead) in poses[other])
+            if len(keys) < _MIN_COMMON:
+                continue
+            common = _relative_pose(boards, poses[one], poses[other], keys, ahead)
+            if best is None or (common.error, abs(ahead)) < (best[0], abs(best[1])):
+                best = (common.error, ahead, len(keys), common)
+        if best is not None and best[0] <= _DISAGREE:
+            edges.append((best[2], -best[0], one, other, best[1], best[3].pose))
+    found = {0: _Start(0, np.eye(3, 4))}
+    while True:
+        reach = [edge for edge in edges if (edge[2] in found) != (edge[3] in found)]
+        if not reach:
+            return found
+        _, _, one, other, ahead, other_from_one = max(reach, key=lambda edge: edge[:2])
+        if one in found:
+            known = found[one]
+            pose = compose(other_from_one, known.cam_from_rig)
+            found[other] = _Start(known.offset + ahead, pose)
+        else:
+            known = found[other]
+            pose = compose(invert(other_from_one), known.cam_from_rig)
+            found[one] = _Start(known.offset - ahead, pose)
+
+
+def _relative_pose(
+    boards: Sequence[Board],
+    first: Mapping[tuple[int, int], Pose],
+    second: Mapping[tuple[int, int], Pose],
+    keys: Sequence[tuple[int, int]],
+    ahead: int,
+) -> CommonPose:
+    """Return the relative pose that the first's views share with the second's `ahead` earlier."""
+    chosen = np.linspace(0, len(keys) - 1, min(len(keys), _JUDGED)).round().astype(int)
+    measured = []
+    lengths = []
+    for board, instant in (keys[index] for index in chosen):
+        from_first = invert(first[board, instant])
+        pose = second[board, instant - ahead]
+        lengths.append(float(np.linalg.norm(pose[:, 3])))
+        measured.append(
+            np.stack(
+                [
+                    compose(compose(pose, boards[board].board_from_turned(look)), from_first)
+                    for look in range(len(boards[board].looks))
+                ]
+            )
+        )
+    return common_pose(measured, np.ones(len(measured)), float(np.median(lengths)))
+
+
+# --- Fractions of frames ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    offset_frames: NDArray[np.float64]
+    std_frames: NDArray[np.float64]
+    motion: NDArray[np.float64]
+    rms_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sampled:
+    """All views at given offsets: residuals (V, N, 2) px and their slopes; 0 where not seen."""
+
+    residuals: NDArray[np.float64]
+    by_point: NDArray[np.float64]
+    points_cam: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    speed_noise: NDArray[np.float64]
+    common_noise: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+
+
+class _Problem:
+    """Offsets, poses of cameras and of boards at chosen instants, and the tracks that tell them."""
+
+    def __init__(
+        self,
+        points: NDArray[np.float64],
+        focal_px: NDArray[np.float64],
+        rays: Sequence[_Tracks],
+        views: Sequence[tuple[int, int, int, int, NDArray[np.intp]]],
+        start: Mapping[int, _Start],
+        rig_from_board: NDArray[np.float64],
+        spacing: int,
+    ) -> None:
+        self.points = points  # (B, N, 3)
+        self.focal_px = focal_px
+        self.rays = rays
+        self.views = views  # camera, pose, board, instant, listing
+        self.spacing = spacing
+        self.cameras = np.array([view[0] for view in views])
+        self.poses = np.array([view[1] for view in views])
+        self.board_points = points[[view[2] for view in views]]  # (V, N, 3)
+        self.rig_from_board = rig_from_board
+        n_cameras = len(focal_px)
+        self.offsets = np.array(
+            [start[c].offset if c in start else 0 for c in range(n_cameras)], np.float64
+        )
+        self.cam_from_rig = np.stack(
+            [start[c].cam_from_rig if c in start else np.eye(3, 4) for c in range(n_cameras)]
+        )
+
+    @classmethod
+    def of(
+        cls,
+        boards: Sequence[Board],
+        cameras: Sequence[Camera],
+        tracks: Sequence[_Tracks],
+        poses: Sequence[Mapping[tuple[int, int], Pose]],
+        start: Mapping[int, _Start],
+        spacing: int,
+    ) -> "_Problem | None":
+        """Choose the instants that most cameras see, and list symmetric boards alike."""
+        most = max(len(board.points_board) for board in boards)
+        points = np.zeros((len(boards), most, 3))
+        for index, board in enumerate(boards):
+            points[index, : len(board.points_board)] = board.points_board
+        rays = [
+            {key: _rays(camera, pixels) for key, pixels in seen.items()}
+            for camera, seen in zip(cameras, tracks, strict=True)
+        ]
+        # A margin of one frame on both sides: fractions are not known yet.
+        usable: dict[tuple[int, int], list[int]] = {}
+        for camera in sorted(start):
+            late = start[camera].offset
+            for key in sorted(rays[camera].keys() & poses[camera].keys()):
+                around = [(key[0], key[1] + step * spacing) for step in (-2, -1, 1, 2)]
+                if all(neighbour in rays[camera] for neighbour in around):
+                    usable.setdefault((key[0], key[1] + late), []).append(camera)
+        shared = sorted(key for key, seeing in usable.items() if len(seeing) > 1)
+        if len(shared) < _MIN_COMMON:
+            return None
+        chosen = np.linspace(0, len(shared) - 1, min(len(shared), _MAX_INSTANTS))
+        views = []
+        rig_from_board = []
+        for number, place in enumerate(chosen.round().astype(int)):
+            board, instant = shared[place]
+            first_pose: Pose | None = None
+            for camera in usable[board, instant]:
+                here = start[camera]
+                turned = np.stack(
+                    [
+                        compose(
+                            invert(here.cam_from_rig),
+                            compose(
+                                poses[camera][board, instant - here.offset],
+                                boards[board].board_from_turned(look),
+                            ),
+                        )
+                        for look in range(len(boards[board].looks))
+                    ]
+                )
+                if first_pose is None:
+                    first_pose = turned[0]
+                look = int(np.argmin(pose_distances(first_pose[None], turned, 1.0)))
+                listing = np.arange(most)
+                listing[: len(boards[board].points_board)] = boards[board].looks[look]
+                views.append((camera, number, board, instant, listing))
+            rig_from_board.append(first_pose)
+        focal_px = np.array([float(camera.pinhole[0, 0]) for camera in cameras])
+        return cls(points, focal_px, rays, views, start, np.array(rig_from_board), spacing)
+
+    def solve(self) -> _Found:
+        """Fit everything by Levenberg and Marquardt's method, robustly."""
+        damping = 1e-4
+        sampled = self._sample(self.offsets, self.cam_from_rig, self.rig_from_board)
+        for _ in range(_MAX_STEPS):
+            weights, limit = self._weights(sampled)
+            normal, right, back = self._normal_equations(sampled, weights)
+            cost = self._cost(sampled, limit)
+            moved = 0.0
+            while damping < 1e8:
+                damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
+                step = np.asarray(np.linalg.solve(damped, right), np.float64)
+                trial = self._moved(step, back(step))
+                trial_sampled = self._sample(*trial)
+                if self._cost(trial_sampled, limit) <= cost:
+                    moved = float(np.abs(trial[0] - self.offsets).max())
+                    self.offsets, self.cam_from_rig, self.rig_from_board = trial
+                    sampled = trial_sampled
+                    damping = max(0.1 * damping, 1e-12)
+                    break
+                damping *= 10.0
+            if moved < _CONVERGED_FRAMES:
+                break
+        weights, _ = self._weights(sampled)
+        normal, _, _ = self._normal_equations(sampled, weights)
+        # Interpolation smooths noise, and neighbouring instants share it: the noise of the frames
+        # themselves is what remains in the mean.
+        n_points = int(sampled.seen.sum())
+        n_unknown = 6 * len(self.rig_from_board) + len(normal)
+        square = (weights * (sampled.residuals**2).sum(axis=2)).sum(axis=1) / sampled.noise
+        variance = float(square.sum()) / max(2 * n_points - n_unknown, 1)
+        scale = np.sqrt(np.diag(normal)) + 1e-12
+        covariance = np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True)
+        covariance *= variance / np.outer(scale, scale)
+        # Noise is smoothed most half-way between frames, where residuals are smallest: that pull
+        # (the slope of the expected noise) is taken off.
+        n_seen = sampled.seen.sum(axis=1)
+        pull = np.zeros((len(self.offsets), 7))
+        share_left = max(2 * n_points - n_unknown, 1) / (2 * n_points)
+        of_noise = 2.0 * share_left * variance * n_seen * sampled.common_noise
+        np.add.at(pull[:, 6], self.cameras, of_noise)
+        offsets = self.offsets.copy()
+        offsets[1:] -= (covariance @ pull[1:].ravel() / max(variance, 1e-30)).reshape(-1, 7)[:, 6]
+        offset_stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        stds, motion = np.zeros(len(self.offsets)), np.ones(len(self.offsets))
+        for camera in range(1, len(self.offsets)):
+            mine = self.cameras == camera
+            speed = sampled.speed[mine][sampled.seen[mine]]
+            power = float((speed**2).sum(axis=1).mean()) if len(speed) else 0.0
+            noise = 2.0 * variance * float(sampled.speed_noise[mine].mean()) if len(speed) else 0.0
+            motion[camera] = (power - noise) / power if power > 1e-12 else 0.0
+            std = offset_stds[7 * (camera - 1) + 6]
+            # Noise in the speed looks like motion, and like knowledge: it is taken off again.
+            stds[camera] = std / np.sqrt(max(motion[camera], 1e-6))
+        total = float((sampled.residuals**2).sum()) / max(n_points, 1)
+        return _Found(offsets, stds, motion, float(np.sqrt(total)))
+
+    def _sample(
+        self,
+        offsets: NDArray[np.float64],
+        cam_from_rig: NDArray[np.float64],
+        rig_from_board: NDArray[np.float64],
+    ) -> _Sampled:
+        n_views, n_points = self.board_points.shape[:2]
+        tracked, speed = np.full((2, n_views, n_points, 2), np.nan)
+        noise, speed_noise, common_noise = np.ones(n_views), np.zeros(n_views), np.zeros(n_views)
+        for row, (camera, _, board, instant, listing) in enumerate(self.views):
+            track = _interpolated(self.rays[camera], board, instant - offsets[camera], self.spacing)
+            if track is not None:
+                tracked[row, : len(track.points)] = track.points
+                speed[row, : len(track.points)] = track.speed
+                tracked[row], speed[row] = tracked[row][listing], speed[row][listing]
+                noise[row], speed_noise[row] = track.noise, track.speed_noise
+                common_noise[row] = track.common_noise
+        placed = rig_from_board[self.poses]
+        points_rig = self.board_points @ placed[:, :, :3].swapaxes(1, 2) + placed[:, None, :, 3]
+        seeing = cam_from_rig[self.cameras]
+        points_cam = points_rig @ seeing[:, :, :3].swapaxes(1, 2) + seeing[:, None, :, 3]
+        x, y, z = np.moveaxis(points_cam, 2, 0)
+        focal = self.focal_px[self.cameras][:, None, None]
+        seen = np.isfinite(tracked).all(axis=2) & (z > 1e-3)
+        z = np.where(seen, z, 1.0)
+        flat = np.stack([x / z, y / z], axis=2)
+        residuals = np.where(seen[:, :, None], focal * (tracked - flat), 0.0)
+        zero = np.zeros_like(z)
+        by_point = np.stack(
+            [
+                np.stack([1.0 / z, zero, -x / z**2], axis=2),
+                np.stack([zero, 1.0 / z, -y / z**2], axis=2),
+            ],
+            axis=2,
+        )  # (V, N, 2, 3)
+        by_point = np.where(seen[:, :, None, None], focal[..., None] * by_point, 0.0)
+        speed = np.where(seen[:, :, None], focal * speed, 0.0)
+        return _Sampled(
+            residuals, by_point, points_cam, speed, noise, speed_noise, common_noise, seen
+        )
+
+    def _weights(self, sampled: _Sampled) -> tuple[NDArray[np.float64], float]:
+        """Return the weights (V, N) of Huber's loss, and where it leaves the square."""
+        misses = np.linalg.norm(sampled.residuals, axis=2)
+        sigma = 0.85 * float(np.median(misses[sampled.seen]))  # of a two-dimensional error
+        limit = max(_LOSS_SIGMAS * sigma, 1e-9)
+        return np.where(misses <= limit, 1.0, limit / np.maximum(misses, limit)), limit
+
+    @staticmethod
+    def _cost(sampled: _Sampled, limit: float) -> float:
+        misses = np.linalg.norm(sampled.residuals, axis=2)[sampled.seen]
+        if not len(misses):
+            return np.inf
+        loss = np.where(misses <= limit, misses**2, 2.0 * limit * misses - limit**2)
+        return float(loss.mean())  # the mean: as offsets move, corners come and go
+
+    def _normal_equations(
+        self, sampled: _Sampled, weights: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], "_Back"]:
+        """Return the equations of cameras and offsets, the boards' poses eliminated."""
+        n_views = len(self.views)
+        n_cameras, n_poses = len(self.offsets), len(self.rig_from_board)
+        camera_part = np.zeros((n_views, sampled.residuals.shape[1], 2, 7))
+        camera_part[..., :6] = _by_motion(sampled.by_point, sampled.points_cam)
+        camera_part[..., 6] = sampled.speed  # the residual falls by it as the offset grows
+        seeing = self.cam_from_rig[self.cameras]
+        points_rig = (sampled.points_cam - seeing[:, None, :, 3]) @ seeing[:, :, :3]
+        board_part = _by_motion(sampled.by_point @ seeing[:, None, :, :3], points_rig)
+        weighted = weights[..., None, None] * camera_part
+        cc = np.einsum("vnki,vnkj->vij", weighted, camera_part)
+        cb = np.einsum("vnki,vnkj->vij", weighted, board_part)
+        bb = np.einsum("vnki,vnkj,vn->vij", board_part, board_part, weights)
+        rc = np.einsum("vnki,vnk->vi", weighted, sampled.residuals)
+        rb = np.einsum("vnki,vnk,vn->vi", board_part, sampled.residuals, weights)
+        normal = np.zeros((n_cameras, 7, n_cameras, 7))
+        right = np.zeros((n_cameras, 7))
+        across = np.zeros((n_poses, n_cameras, 7, 6))
+        boards, right_boards = np.zeros((n_poses, 6, 6)), np.zeros((n_poses, 6))
+        for camera in range(n_cameras):
+            normal[camera, :, camera] = cc[self.cameras == camera].sum(axis=0)
+        np.add.at(right, self.cameras, rc)
+        np.add.at(across, (self.poses, self.cameras), cb)
+        np.add.at(boards, self.poses, bb)
+        np.add.at(right_boards, self.poses, rb)
+        boards += 1e-9 * np.eye(6) * (1.0 + np.trace(boards, axis1=1, axis2=2))[:, None, None]
+        # The reference holds the rig's frame and the session's clock.
+        flat = across[:, 1:].reshape(n_poses, -1, 6)
+        size = flat.shape[1]
+        solved = np.asarray(
+            np.linalg.solve(boards, flat.swapaxes(1, 2)), np.float64
+        )  # (P, 6, size)
+        whole = normal[1:, :, 1:].reshape(size, size) - np.einsum("pia,paj->ij", flat, solved)
+        solved_right = np.asarray(np.linalg.solve(boards, right_boards[..., None]), np.float64)[
+            ..., 0
+        ]
+        reduced = right[1:].ravel() - np.einsum("pia,pa->i", flat, solved_right)
+        return whole, reduced, _Back(solved, solved_right)
+
+    def _moved(
+        self, step: NDArray[np.float64], board_steps: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        steps = step.reshape(-1, 7)
+        offsets = self.offsets.copy()
+        offsets[1:] += np.clip(steps[:, 6], -0.5, 0.5)
+        cam_from_rig = self.cam_from_rig.copy()
+        for camera, motion in enumerate(steps[:, :6], start=1):
+            cam_from_rig[camera] = _nudged(cam_from_rig[camera], motion)
+        placed = np.stack(
+            [_nudged(*pair) for pair in zip(self.rig_from_board, board_steps, strict=True)]
+        )
+        return offsets, cam_from_rig, placed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Back:
+    """How the boards' poses follow from the rest."""
+
+    solved: NDArray[np.float64]
+    solved_right: NDArray[np.float64]
+
+    def __call__(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(self.solved_right - self.solved @ step)
+
+
+def _by_motion(by_point: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return slopes (V, N, 2, 6) by turn and shift from those by points (V, N, 2, 3)."""
+    turn = np.cross(points[:, :, None, :], by_point)
+    return np.concatenate([turn, by_point], axis=3)
+
+
+def _nudged(pose: Pose, motion: NDArray[np.float64]) -> Pose:
+    turn = np.asarray(cv2.Rodrigues(motion[:3])[0], np.float64)
+    return np.column_stack([turn @ pose[:, :3], turn @ pose[:, 3] + motion[3:]])
+
+
+def _rays(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rays (N, 2) at depth 1; NaN where a point is not seen."""
+    rays = np.full(pixels.shape, np.nan)
+    seen = is_seen(pixels)
+    if seen.any():
+        rays[seen] = cam_from_img(camera, pixels[seen])
+    return rays
