@@ -2,13 +2,20 @@
 
 import json
 from contextlib import closing
-from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hybridve.cli import options
 from hybridve.cli.progress import StageProgress, progress_bar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hybridve.calib.rig import Rig
+    from hybridve.hull.capture.recording import Mask
+    from hybridve.hull.capture.session import Session
 
 
 @click.command(short_help="Cut the real things out of the recording.")
@@ -52,8 +59,6 @@ def segment(
     from hybridve.hull.capture.rig import has_rig, load_rig, rig_digest
     from hybridve.hull.capture.session import load_session
     from hybridve.hull.capture.silhouette_io import SilhouetteWriter
-    from hybridve.hull.consistency import drop_unconfirmed
-    from hybridve.hull.evaluate import rig_views
     from hybridve.hull.report.write import refuse_existing
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
@@ -65,7 +70,7 @@ def segment(
     digest, clean = None, None
     if not unconfirmed and has_rig(loaded):
         rig = load_rig(loaded)
-        digest, clean = rig_digest(rig), partial(drop_unconfirmed, *rig_views(loaded, rig))
+        digest, clean = rig_digest(rig), _cleaner(loaded, rig)
 
     names = [camera.name for camera in loaded.cameras]
     object_pixels = [0] * len(names)
@@ -79,7 +84,7 @@ def segment(
         for frame in frames:
             masks = frame.masks
             if masks is not None and clean is not None:
-                masks = clean(masks)
+                masks = clean(frame.index, masks)
             writer.append(masks, frame.reason)
             n_frames += 1
             if masks is None:
@@ -112,3 +117,21 @@ def segment(
     )
     for name, share in shares.items():
         click.echo(f"  {name}: {share:.1%} of the picture is object, on average")
+
+
+def _cleaner(session: "Session", rig: "Rig") -> "Callable[[int, list[Mask]], list[Mask]]":
+    """Return what drops the pieces of a frame's silhouettes that no other camera confirms."""
+    from hybridve.hull.capture.tracks import read_tracks
+    from hybridve.hull.consistency import drop_unconfirmed
+    from hybridve.hull.evaluate import first_rig, moved_views, rig_views
+
+    tracks = read_tracks(session, rig)
+    first, lenses = rig_views(session, first_rig(rig, tracks))
+
+    def clean(index: int, masks: "list[Mask]") -> "list[Mask]":
+        if tracks.missing(index):  # where nobody knows what a camera sees, nothing is dropped
+            return masks
+        views = moved_views(session, rig, tracks, index, first, lenses)
+        return drop_unconfirmed(views, lenses, masks)
+
+    return clean

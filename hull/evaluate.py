@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.calib.lens import Undistortion, trimmed, undistortion
@@ -33,6 +34,7 @@ from hybridve.hull.capture.recording import (
 from hybridve.hull.capture.rig import load_rig, rig_digest
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.capture.tracks import Tracks, read_tracks
 from hybridve.hull.contact.backtrack import approach_speed, first_contact
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.detect import (
@@ -102,11 +104,13 @@ class Chain:
     undistortions : list of Undistortion
         Per camera of the session.
     views : Views
-        The cameras' pinhole images.
+        The cameras' pinhole images; moving cameras where they are first tracked (see `views_at`).
     bodies : list of Body
         The scene's objects, laid into viewports.
     silhouettes : Path or None
         Where stored silhouettes stand that are those of this session; None to segment now.
+    tracks : Tracks
+        Where moving cameras were.
     """
 
     session: Session
@@ -117,15 +121,46 @@ class Chain:
     views: Views
     bodies: list[Body]
     silhouettes: Path | None
+    tracks: Tracks = field(default_factory=Tracks)
 
 
 def rig_views(session: Session, rig: Rig) -> tuple[Views, list[Undistortion]]:
     """Return the session's cameras as pinhole views, and how their images become so."""
-    cameras = [rig[camera.name] for camera in session.cameras]
-    lenses = [undistortion(camera) for camera in cameras]
+    lenses = [undistortion(rig[camera.name]) for camera in session.cameras]
     if session.unseen == "keep":  # gaps are background, but nobody saw them: no image, no gaps
         lenses = [trimmed(lens) for lens in lenses]
-    views = make_views(
+    return _lens_views(session, rig, lenses), lenses
+
+
+def moved_views(
+    session: Session, rig: Rig, tracks: Tracks, index: int, first: Views, lenses: list[Undistortion]
+) -> Views:
+    """Return the views of one frame, about the origin of the first.
+
+    Parameters
+    ----------
+    session, rig
+        Whose cameras.
+    tracks : Tracks
+        Where the moving ones were; in this frame none is missing.
+    index : int
+        Number of the frame.
+    first, lenses
+        What `rig_views` gave. Where no camera moves, `first` is returned.
+    """
+    if not tracks:
+        return first
+    return _lens_views(session, rig.at(tracks.at(index)), lenses, first.origin_world)
+
+
+def _lens_views(
+    session: Session,
+    rig: Rig,
+    lenses: list[Undistortion],
+    origin_world: NDArray[np.float64] | None = None,
+) -> Views:
+    cameras = [rig[camera.name] for camera in session.cameras]
+    return make_views(
         tuple(camera.name for camera in cameras),
         np.array([(lens.width_px, lens.height_px) for lens in lenses], np.int64),
         np.array(
@@ -136,8 +171,8 @@ def rig_views(session: Session, rig: Rig) -> tuple[Views, list[Undistortion]]:
         ),
         session.unseen,
         session.min_cameras,
+        origin_world,
     )
-    return views, lenses
 
 
 def make_chain(session: Session, scene: Scene, settings: EvaluateSettings) -> Chain:
@@ -149,11 +184,12 @@ def make_chain(session: Session, scene: Scene, settings: EvaluateSettings) -> Ch
         If recordings, rig and scene do not fit together.
     """
     rig = load_rig(session)
+    tracks = read_tracks(session, rig)
     silhouettes = stored_silhouettes(session, rig_digest(rig))
     if silhouettes is None:
         check_recording(session)
         check_lengths(session, settings.frames)
-    views, undistortions = rig_views(session, rig)
+    views, undistortions = rig_views(session, first_rig(rig, tracks))
     bodies = []
     for scene_object in scene.objects:
         try:
@@ -165,7 +201,22 @@ def make_chain(session: Session, scene: Scene, settings: EvaluateSettings) -> Ch
                 f"{scene.path}: object {scene_object.name!r}: {error}; ask for less accuracy, or "
                 "refine the mesh"
             ) from error
-    return Chain(session, rig, scene, settings, undistortions, views, bodies, silhouettes)
+    return Chain(session, rig, scene, settings, undistortions, views, bodies, silhouettes, tracks)
+
+
+def first_rig(rig: Rig, tracks: Tracks) -> Rig:
+    """Return the rig with moving cameras where they are first tracked all together."""
+    return rig if tracks.first is None else rig.at(tracks.at(tracks.first))
+
+
+def views_at(chain: Chain, index: int) -> Views:
+    """Return the views of a frame in which no tracked pose is missing.
+
+    They keep the local origin of all others. Where no camera moves, they are the same object.
+    """
+    return moved_views(
+        chain.session, chain.rig, chain.tracks, index, chain.views, chain.undistortions
+    )
 
 
 def evaluate(
@@ -293,7 +344,7 @@ def _look(
     """Return what one frame says by itself, without those before; None if it cannot be read."""
     if silhouettes.masks is None:
         return None
-    hull = make_hull(chain.views, silhouettes.masks)
+    hull = make_hull(views_at(chain, silhouettes.index), silhouettes.masks)
     contacts = detect_contacts(hull, chain.bodies, tools.engine)
     watch.lap("query")
     if tools.certifier is not None:
@@ -434,6 +485,7 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "segmentation": asdict(session.segmentation),
         "silhouettes": None if chain.silhouettes is None else str(chain.silhouettes),
         "local_origin_m": chain.views.origin_world.tolist(),
+        **({"poses_sha256": dict(chain.tracks.sha256)} if chain.tracks else {}),
     }
 
 
@@ -488,6 +540,7 @@ def _silhouettes(
         chain.session,
         chain.silhouettes,
         rest,
+        tracks=chain.tracks,
         undistortions=chain.undistortions,
         progress=progress,
     )

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
+from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import (
     FrameRange,
     recording_of,
@@ -14,7 +15,7 @@ from hybridve.hull.capture.recording import (
 )
 from hybridve.hull.consistency import drop_unconfirmed
 from hybridve.hull.contact.detect import Contact, detect_contacts
-from hybridve.hull.evaluate import Chain
+from hybridve.hull.evaluate import Chain, views_at
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.view.picture import (
@@ -35,6 +36,8 @@ class Shot:
     ----------
     chain : Chain
         The recording it is from.
+    rig : Rig
+        Its cameras, where they were in this frame.
     index : int
         Number of the frame.
     masks : list of (H, W) uint8
@@ -46,6 +49,7 @@ class Shot:
     """
 
     chain: Chain
+    rig: Rig
     index: int
     masks: list[NDArray[np.uint8]]
     hull: Hull
@@ -58,18 +62,22 @@ def take_shot(chain: Chain, index: int, engine: Engine) -> Shot:
     Raises
     ------
     SessionError
-        If the recording does not have this frame, or a camera lacks it.
+        If the recording does not have this frame, or a camera lacks it, or it is not known where
+        one was.
     """
     for frame in segmented_frames(chain.session, FrameRange(index, index + 1)):
-        if frame.masks is None:
-            raise SessionError(f"{chain.session.path}: frame {index}: {frame.reason}")
-        masks = drop_unconfirmed(chain.views, chain.undistortions, frame.masks)
+        reason = frame.reason or chain.tracks.missing(index)
+        if frame.masks is None or reason:
+            raise SessionError(f"{chain.session.path}: frame {index}: {reason}")
+        views = views_at(chain, index)
+        masks = drop_unconfirmed(views, chain.undistortions, frame.masks)
         undistorted = [
             undistort_mask(mask, lens)
             for mask, lens in zip(masks, chain.undistortions, strict=True)
         ]
-        hull = make_hull(chain.views, undistorted)
-        return Shot(chain, index, masks, hull, detect_contacts(hull, chain.bodies, engine))
+        hull = make_hull(views, undistorted)
+        rig = chain.rig.at(chain.tracks.at(index))
+        return Shot(chain, rig, index, masks, hull, detect_contacts(hull, chain.bodies, engine))
     raise SessionError(f"{chain.session.path}: the recording has no frame {index}")
 
 
@@ -84,7 +92,7 @@ def draw_scene(shot: Shot, size_px: tuple[int, int]) -> Image:
     outcome = f"touched: {', '.join(touched)}" if touched else "nothing is touched"
     return draw_picture(
         shot.hull,
-        shot.chain.rig,
+        shot.rig,
         _drawn_objects(shot),
         size_px=size_px,
         title=f"{shot.chain.session.name}, frame {shot.index} ({time_s:.2f} s)",
@@ -100,7 +108,7 @@ def draw_cameras(shot: Shot, columns: int = 2) -> Image:
         recording = recording_of(shot.chain.session, camera)
         number = shot.index - camera.shift_frames
         for image in recording.frames(number, number + 1):
-            pictures.append(draw_overlay(image, shot.chain.rig[camera.name], mask, objects))
+            pictures.append(draw_overlay(image, shot.rig[camera.name], mask, objects))
     return contact_sheet(pictures, columns)
 
 

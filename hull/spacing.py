@@ -28,7 +28,7 @@ from hybridve.hull.contact.spacing import (
     verdict_at,
     without,
 )
-from hybridve.hull.evaluate import Chain, resolved_settings
+from hybridve.hull.evaluate import Chain, resolved_settings, views_at
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.report.spacing_file import (
     Binding,
@@ -179,6 +179,7 @@ def replay(
         chain.session,
         chain.silhouettes,
         chain.settings.frames,
+        tracks=chain.tracks,
         undistortions=chain.undistortions,
         progress=progress,
     )
@@ -188,7 +189,7 @@ def replay(
             if frame.masks is None:
                 tally.leave_out(frame.index, time_s, frame.reason)
             else:
-                hull = make_hull(chain.views, frame.masks)
+                hull = make_hull(views_at(chain, frame.index), frame.masks)
                 tally.look(frame.index, time_s, grown(hull, grow_px) if grow_px else hull)
             advance()
     if not tally.n_valid:

@@ -356,7 +356,7 @@ def test_hulls_of_other_cameras_and_contacts_without_a_point_are_refused(
     certifier: Certifier, engine: Native
 ) -> None:
     hull = ball(0.0, 0.1)
-    others = ball_hull(ring_views(4, 480, 324, 470.0), np.zeros(3), 0.05)
+    others = ball_hull(ring_views(4, 480, 324, 471.0), np.zeros(3), 0.05)
     body = make_body(plates(-0.2), viewport=10)
     nothing = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
     with pytest.raises(ValueError, match="not of the same views"):

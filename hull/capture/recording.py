@@ -11,8 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import METHOD_VERSION, Segmenter, threshold_mask
 from hybridve.hull.capture.session import Session, SessionCamera
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.capture.tracks import Tracks
 
 Mask = NDArray[np.uint8]
 
@@ -221,10 +222,13 @@ def silhouettes_of(
     stored: Path | None,
     frames: FrameRange,
     *,
+    tracks: Tracks | None = None,
     undistortions: list[Undistortion] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Generator[FrameSilhouettes]:
     """Yield the silhouettes of a session's frames, from where they are stored or cut out now.
+
+    A frame in which the pose of a moving camera is missing is yielded with the reason.
 
     Parameters
     ----------
@@ -232,6 +236,8 @@ def silhouettes_of(
         The recordings.
     stored : Path or None
         What `stored_silhouettes` says.
+    tracks : Tracks, optional
+        Where the moving cameras were.
     frames, undistortions, progress
         As of `segmented_frames`.
 
@@ -243,10 +249,26 @@ def silhouettes_of(
         If stored silhouettes cannot be read.
     """
     if stored is None:
-        yield from segmented_frames(session, frames, undistortions=undistortions, progress=progress)
+        cut = segmented_frames(session, frames, undistortions=undistortions, progress=progress)
+        yield from _placed(cut, tracks)
         return
     with SilhouetteReader(stored) as reader:
-        yield from stored_frames(session, reader, frames, undistortions=undistortions)
+        yield from _placed(
+            stored_frames(session, reader, frames, undistortions=undistortions), tracks
+        )
+
+
+def _placed(
+    frames: Generator[FrameSilhouettes], tracks: Tracks | None
+) -> Generator[FrameSilhouettes]:
+    """Yield frames, without silhouettes those in which a camera's place is not known."""
+    with closing(frames):
+        for frame in frames:
+            missing = "" if tracks is None else tracks.missing(frame.index)
+            if missing:
+                reasons = [frame.reason, missing] if frame.reason else [missing]
+                frame = replace(frame, masks=None, reason="; ".join(reasons))
+            yield frame
 
 
 def silhouette_stamp(session: Session, rig_digest: str | None) -> str:
@@ -263,10 +285,12 @@ def silhouette_stamp(session: Session, rig_digest: str | None) -> str:
     """
     files = []
     for camera in session.cameras:
-        for source in (camera.background, camera.recording):
-            for path in source.paths if source is not None else ():
-                status = path.stat()
-                files.append([str(path), status.st_size, status.st_mtime_ns])
+        sources = [one for one in (camera.background, camera.recording) if one is not None]
+        paths = [path for source in sources for path in source.paths]
+        # Where a camera was decides which pieces the others confirm.
+        for path in paths if camera.poses is None else [*paths, camera.poses]:
+            status = path.stat()
+            files.append([str(path), status.st_size, status.st_mtime_ns])
     return json.dumps(
         {
             "method": METHOD_VERSION,

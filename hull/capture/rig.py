@@ -80,9 +80,10 @@ def load_rig(session: Session) -> Rig:
 
 
 def rig_digest(rig: Rig) -> str:
-    """Return a text that is the same for the same cameras only."""
-    cameras = rig_to_dict(rig)["cameras"]
-    return hashlib.sha256(json.dumps(cameras, sort_keys=True).encode()).hexdigest()
+    """Return a text that is the same for the same cameras on the same mounts only."""
+    content = rig_to_dict(rig)
+    told = [content["cameras"], content["mounts"]] if rig.mounts else content["cameras"]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
 def _take_elsewhere(session: Session, rig_file: RigFile, progress: Progress | None) -> Rig:

@@ -20,6 +20,8 @@ pixels are good enough.
 An outline that moves by one pixel passes that pixel half-way, by construction: a thing slower than
 some pixels a frame has its contact in the middle, which is the best that can be said.
 
+A camera that moves is taken to go straight and to turn evenly between its two poses.
+
 What no shift explains and no blend keeps, something that was not there a frame before, is told by
 the status "outline lost": then the instant is unknown within the frame.
 """
@@ -37,7 +39,7 @@ from hybridve.hull.contact.detect import Body, Contact
 from hybridve.hull.query.certify import COLLIDING, Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.silhouettes import Hull, Views, interpolated_views, make_hull
 from hybridve.hull.query.viewport import sample_positions
 
 #: Distances to an outline end here, so that they depend on no pixel farther away.
@@ -171,16 +173,16 @@ def interpolated_hull(before: Hull, after: Hull, fraction: float) -> Hull:
     Raises
     ------
     ValueError
-        If the fraction is not within 0..1, or the two hulls are not of the same views.
+        If the fraction is not within 0..1, or the two hulls are not of the same cameras.
     """
-    _check_views(before, after)
+    views = interpolated_views(before.views, after.views, fraction)
     cameras = range(len(before.views))
     masks = interpolate_masks(
         [before.mask(camera) for camera in cameras],
         [after.mask(camera) for camera in cameras],
         fraction,
     )
-    return make_hull(before.views, masks)
+    return make_hull(views, masks)
 
 
 def first_contact(
@@ -199,7 +201,7 @@ def first_contact(
     Parameters
     ----------
     before, after : Hull
-        The last frame without and the first with a collision, of the same views.
+        The last frame without and the first with a collision, of the same cameras.
     body : Body
         The object, at rest between the two.
     contact : Contact
@@ -213,23 +215,23 @@ def first_contact(
     Raises
     ------
     ValueError
-        If the hulls are not of the same views, or the contact has neither points nor a witness.
+        If the hulls are not of the same cameras, or the contact has neither points nor a witness.
     """
-    _check_views(before, after)
+    interpolated_views(before.views, after.views, 0.5)  # or they are refused
     if not contact.collides and not np.isfinite(contact.witness_world).all():
         raise ValueError(f"object {body.name}: the contact has neither points nor a witness")
     probe = _Probe(body, certifier, engine)
     if probe.touches(before):
         return FirstContact(0.0, 1.0, probe.patch_center(before), "touches before")
-    views = before.views
     outlines = [
         _follow(before.mask(camera), after.mask(camera), window)
-        for camera, window in enumerate(_windows(views, body))
+        for camera, window in enumerate(_windows(before.views, after.views, body))
     ]
 
     def hull_at(fraction: float) -> Hull:
         if fraction == 1.0:
             return after
+        views = interpolated_views(before.views, after.views, fraction)
         return make_hull(views, [outline.at(fraction) for outline in outlines])
 
     free, touching = 0.0, 1.0
@@ -302,11 +304,6 @@ def approach_speed(
 def _difference(first: float, second: float, unbounded: float) -> float:
     """Return first - second, and `unbounded` where both are infinite."""
     return unbounded if math.isinf(first) and first == second else float(first) - float(second)
-
-
-def _check_views(before: Hull, after: Hull) -> None:
-    if before.views is not after.views:
-        raise ValueError("the hulls before and after are not of the same views")
 
 
 def _point_of(contact: Contact) -> NDArray[np.float64]:
@@ -688,16 +685,21 @@ def _box_of(mask: NDArray[np.uint8]) -> _Box:
     return top, top + height, left, left + width
 
 
-def _windows(views: Views, body: Body) -> list[_Box]:
-    """Return for each camera a box that the object projects into, with some pixels to spare."""
+def _windows(views: Views, after: Views, body: Body) -> list[_Box]:
+    """Return for each camera a box that the object projects into, with some pixels to spare.
+
+    The whole image of a camera that moves: on its way the object may pass anywhere.
+    """
     ends_local = np.stack([body.lower_world, body.upper_world]) - views.origin_world
     corners_local = np.array(list(itertools.product(*ends_local.T)))  # (8, 3)
     windows = []
-    for (width, height), matrix in zip(views.sizes_px.tolist(), views.img_from_local, strict=True):
+    for (width, height), matrix, later in zip(
+        views.sizes_px.tolist(), views.img_from_local, after.img_from_local, strict=True
+    ):
         whole = (0, height, 0, width)
         projected = corners_local @ matrix[:, :3].T + matrix[:, 3]  # (8, 3)
-        if projected[:, 2].min() <= 1e-6:
-            windows.append(whole)  # part of it is behind the camera
+        if projected[:, 2].min() <= 1e-6 or (matrix != later).any():
+            windows.append(whole)  # part of it is behind the camera, or the camera moves
             continue
         pixels = projected[:, :2] / projected[:, 2:]
         left, top = np.clip(np.floor(pixels.min(axis=0)) - 2, 0, (width, height)).tolist()

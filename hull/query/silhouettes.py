@@ -11,7 +11,7 @@ The silhouettes are those of pinhole images: lens distortion was removed from th
 the floor of the projection; the centre of the top-left pixel is (0.5, 0.5).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 
 Unseen = Literal["carve", "keep"]
 
+#: Two projections are those of one camera if a rotation leads from one to the other, to this error.
+_ROTATION_TOLERANCE = 1e-6
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """What stays the same from frame to frame: the cameras' pinhole images.
+    """The cameras' pinhole images; the same from frame to frame unless a camera moves.
 
     Attributes
     ----------
@@ -58,11 +61,12 @@ def make_views(
     img_from_world: NDArray[np.float64],
     unseen: Unseen = "carve",
     min_cameras: int = 1,
+    origin_world: NDArray[np.float64] | None = None,
 ) -> Views:
     """Return views about a local origin near the working volume.
 
     The origin is the point nearest to all optical axes, or the mean of the cameras where the axes
-    are parallel.
+    are parallel. Cameras that move keep the origin that they began with.
 
     Parameters
     ----------
@@ -75,6 +79,8 @@ def make_views(
         third coordinate is positive.
     unseen, min_cameras
         See `Views`.
+    origin_world : (3,) float64, optional
+        The local origin, if it is known already.
 
     Raises
     ------
@@ -89,9 +95,16 @@ def make_views(
     if not (norms > 0).all():
         raise ValueError(f"camera {names[int(norms.argmin())]}: the projection matrix is singular")
     scaled = img_from_world / norms[:, None, None]
-    axes = axes / norms[:, None]
-    centers = -np.linalg.solve(scaled[:, :, :3], scaled[:, :, 3:])[..., 0]  # (C, 3)
+    origin = _origin(scaled) if origin_world is None else origin_world
+    img_from_local = scaled.copy()
+    img_from_local[:, :, 3] += scaled[:, :, :3] @ origin
+    return Views(names, np.asarray(sizes_px, np.int64), img_from_local, origin, unseen, min_cameras)
 
+
+def _origin(img_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the local origin (3,) of scaled projections (C, 3, 4), metres."""
+    axes = img_from_world[:, 2, :3]
+    centers = _centers(img_from_world)
     # Least squares over the distances to the optical axes.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (C, 3, 3)
     normal_matrix = across.sum(axis=0)
@@ -99,13 +112,55 @@ def make_views(
         origin = np.linalg.solve(normal_matrix, np.einsum("cij,cj->i", across, centers))
     else:
         origin = centers.mean(axis=0)
-    origin = np.asarray(
-        np.round(origin, 2), np.float64
-    )  # centimetres: short numbers, the same on every machine
+    # Centimetres: short numbers, the same on every machine.
+    return np.asarray(np.round(origin, 2), np.float64)
 
-    img_from_local = scaled.copy()
-    img_from_local[:, :, 3] += scaled[:, :, :3] @ origin
-    return Views(names, np.asarray(sizes_px, np.int64), img_from_local, origin, unseen, min_cameras)
+
+def _centers(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where the cameras of projections (C, 3, 4) stand, (C, 3)."""
+    return np.asarray(-np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0])
+
+
+def interpolated_views(before: Views, after: Views, fraction: float) -> Views:
+    """Return the views of an instant between two frames; cameras move straight and turn evenly.
+
+    Parameters
+    ----------
+    before, after : Views
+        Of two frames: the same cameras about the same origin, perhaps moved. If they are one, it
+        is returned.
+    fraction : float
+        The instant: 0 gives `before`, 1 gives `after`.
+
+    Raises
+    ------
+    ValueError
+        If they are not of the same cameras.
+    """
+    if before is after:
+        return before
+    first, second = before.img_from_local, after.img_from_local
+    if (
+        before.names != after.names
+        or (before.unseen, before.min_cameras) != (after.unseen, after.min_cameras)
+        or (before.sizes_px != after.sizes_px).any()
+        or (before.origin_world != after.origin_world).any()
+    ):
+        raise ValueError("not of the same views, nor of the same cameras moved")
+    # Both are K R with one K, or they are not of one camera.
+    turns = np.linalg.solve(first[:, :, :3], second[:, :, :3])  # (C, 3, 3)
+    error = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max()
+    if not error < _ROTATION_TOLERANCE:
+        raise ValueError("not of the same views, nor of the same cameras moved")
+    if fraction in (0.0, 1.0):
+        return after if fraction else before
+    centers = (1.0 - fraction) * _centers(first) + fraction * _centers(second)
+    matrices = first.copy()
+    for camera in np.flatnonzero((first != second).any(axis=(1, 2))):
+        vector = cv2.Rodrigues(turns[camera])[0]
+        matrix = first[camera, :, :3] @ cv2.Rodrigues(fraction * vector)[0]
+        matrices[camera] = np.column_stack([matrix, -matrix @ centers[camera]])
+    return replace(before, img_from_local=matrices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

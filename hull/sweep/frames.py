@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SessionError
 from hybridve.hull.capture.recording import FrameRange, silhouettes_of
 from hybridve.hull.contact.detect import Body
-from hybridve.hull.evaluate import Chain
+from hybridve.hull.evaluate import Chain, views_at
 from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
@@ -66,7 +66,7 @@ def read_hulls(
     progress: Callable[[str, int, int], None] | None = None,
     advance: Callable[[], object] = lambda: None,
 ) -> list[HullFrame]:
-    """Return the chosen frames of a chain; those that a camera lacks are left out, with a warning.
+    """Return the chosen frames of a chain; those that cannot be read are left out, with a warning.
 
     Parameters
     ----------
@@ -88,6 +88,7 @@ def read_hulls(
         chain.session,
         chain.silhouettes,
         chain.settings.frames,
+        tracks=chain.tracks,
         undistortions=chain.undistortions,
         progress=progress,
     )
@@ -97,7 +98,7 @@ def read_hulls(
             if frame.masks is None:
                 _log.warning("frame %d is left out: %s", frame.index, frame.reason)
                 continue
-            hull = make_hull(chain.views, frame.masks)
+            hull = make_hull(views_at(chain, frame.index), frame.masks)
             n_bytes += hull.masks_flat.nbytes + hull.integrals_flat.nbytes
             if n_bytes > _MOST_BYTES:
                 raise SessionError(
@@ -125,9 +126,10 @@ def read_hulls(
 
 def _timed(frame: HullFrame, chain: Chain) -> HullFrame:
     """Return a frame with the seconds of its hull and boxes, now that nothing else runs."""
-    masks = [frame.hull.mask(camera) for camera in range(len(chain.views))]
+    views = frame.hull.views
+    masks = [frame.hull.mask(camera) for camera in range(len(views))]
     started = time.perf_counter()
-    hull = make_hull(chain.views, masks)
+    hull = make_hull(views, masks)
     made = time.perf_counter()
     near_bodies(hull, chain.bodies)
     return replace(frame, hull_s=made - started, boxes_s=time.perf_counter() - made)

@@ -1,0 +1,482 @@
+"""A camera that moves with a tracker, through the whole chain, on a ball whose hull is known."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.cones import ball_extent
+from helpers.hulls import ball_masks, look_at, ring_views
+from helpers.sessions import CUBE, SCENE_HEAD, SESSION_HEAD
+from numpy.typing import NDArray
+
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import CalibrationError, SessionError
+from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.rig import Mount, Rig
+from hybridve.calib.rig_io import read_rig, write_rig
+from hybridve.hull.capture.recording import stored_silhouettes
+from hybridve.hull.capture.rig import rig_digest
+from hybridve.hull.capture.session import load_session
+from hybridve.hull.contact.respond import ResponseSettings
+from hybridve.hull.contact.scene import load_scene
+from hybridve.hull.contact.spacing import Move
+from hybridve.hull.contact.uncertainty import DoubtSettings
+from hybridve.hull.evaluate import (
+    Chain,
+    EvaluateSettings,
+    evaluate,
+    make_chain,
+    resolved_settings,
+    views_at,
+)
+from hybridve.hull.query.engine import Engine
+from hybridve.hull.query.native import Native
+from hybridve.hull.query.silhouettes import Views, interpolated_views, make_hull, make_views
+from hybridve.hull.report.schema import FrameResult
+from hybridve.hull.show import draw_cameras, draw_scene, take_shot
+from hybridve.hull.spacing import Layout, replay
+from hybridve.hull.sweep.frames import read_hulls
+
+Run = Callable[..., int]
+
+SIZE_PX, FOCAL_PX = (320, 240), 330.0
+
+#: The ball comes along x to the cube about the origin, whose faces are 0.1 m from it, and leaves.
+RADIUS_M, HALF_M = 0.15, 0.1
+X_M = np.array([-0.60, -0.50, -0.40, -0.32, -0.22, -0.12, -0.30, -0.45])
+CENTERS = np.column_stack([X_M, np.zeros_like(X_M), np.zeros_like(X_M)])
+
+#: How far an outline of pixels may be off the cone, in pixels: half a diagonal.
+STAIRS_PX = 0.71
+
+#: The head's tracker was lost in this frame.
+LOST = 6
+
+FIXED = [(-0.3, -2.0, 0.6), (-0.2, 0.9, 1.9), (1.2, -1.2, 1.2)]
+MOUNT = Mount(
+    np.column_stack([cv2.Rodrigues(np.array([0.4, -1.1, 0.7]))[0], [0.03, -0.12, 0.05]]),
+    np.column_stack([cv2.Rodrigues(np.array([-0.5, 0.2, 2.0]))[0], [1.5, -0.7, 0.3]]),
+)
+
+
+def head_pose(instant: float) -> Pose:
+    """Return cam_from_world of the head: it walks around the ball and looks about."""
+    angle = 1.9 + 0.22 * instant
+    center = 2.1 * np.array([np.cos(angle), np.sin(angle), 0.3 + 0.05 * instant])
+    return look_at(center, np.array([-0.2, 0.0, 0.07 * instant]), 0.1 * instant)
+
+
+def tracked(cam_from_world: Pose, mount: Mount = MOUNT) -> Pose:
+    """Return tracking_from_tracker while the camera stands there."""
+    world_from_tracker = compose(invert(cam_from_world), mount.cam_from_tracker)
+    return compose(invert(mount.world_from_tracking), world_from_tracker)
+
+
+def camera(name: str, pose: Pose) -> Camera:
+    params = np.array([FOCAL_PX, FOCAL_PX, SIZE_PX[0] / 2, SIZE_PX[1] / 2])
+    return Camera(name, "PINHOLE", *SIZE_PX, params, pose)
+
+
+def true_rig(frame: int) -> Rig:
+    fixed = [
+        camera(f"cam{k}", look_at(np.array(center), np.array([-0.2, 0.0, 0.0])))
+        for k, center in enumerate(FIXED)
+    ]
+    return Rig((*fixed, camera("head", head_pose(frame))), mounts={"head": MOUNT})
+
+
+def views_of(rig: Rig) -> Views:
+    return make_views(
+        tuple(one.name for one in rig.cameras),
+        np.array([SIZE_PX] * len(rig.cameras)),
+        np.array([one.pinhole @ one.cam_from_world for one in rig.cameras]),
+    )
+
+
+def poses_csv(poses: dict[int, Pose]) -> str:
+    names = ",".join(f"m{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
+    rows = [
+        ",".join([str(frame), *(repr(float(value)) for value in pose.ravel())])
+        for frame, pose in poses.items()
+    ]
+    return "\n".join([f"frame,{names}", *rows]) + "\n"
+
+
+def write_session(folder: Path, *, poses: str = 'poses = "head.csv"', extra: str = "") -> Path:
+    """Write the recording: ready masks of three fixed cameras and a moving one."""
+    for frame, center in enumerate(CENTERS):
+        rig = true_rig(frame)
+        for one, mask in zip(rig.cameras, ball_masks(views_of(rig), center, RADIUS_M), strict=True):
+            (folder / one.name).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / one.name / f"{frame}.png"), 255 * mask)
+    (folder / "rig").mkdir(exist_ok=True)
+    write_rig(folder / "rig" / "rig.json", true_rig(3))
+    known = {k: tracked(head_pose(k)) for k in range(len(CENTERS)) if k != LOST}
+    (folder / "head.csv").write_text(poses_csv(known), encoding="utf-8")
+    cameras = [
+        f'[[camera]]\nname = "{one.name}"\nmasks = "{one.name}/*.png"\n'
+        + (poses + "\n" if one.name == "head" else "")
+        for one in true_rig(0).cameras
+    ]
+    path = folder / "session.toml"
+    path.write_text(f"{SESSION_HEAD}{extra}\n" + "\n".join(cameras), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_session(tmp_path_factory.mktemp("head"))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cube")
+    (folder / "cube.obj").write_text(CUBE, encoding="utf-8")
+    path = folder / "scene.toml"
+    path.write_text(
+        f'{SCENE_HEAD}[[object]]\nname = "cube"\nmesh = "cube.obj"\nunit = "mm"\n', encoding="utf-8"
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Engine]:
+    with Native() as native:
+        yield native
+
+
+def chain_of(session: Path, scene: Path, **changes: Any) -> Chain:
+    settings = EvaluateSettings(
+        viewport=10,
+        clearance_m=1e-4,
+        response=ResponseSettings(),
+        backtrack=True,
+        doubt=DoubtSettings(),
+    )
+    return make_chain(load_session(session), load_scene(scene), replace(settings, **changes))
+
+
+@pytest.fixture(scope="module")
+def chain(session: Path, scene: Path) -> Chain:
+    return chain_of(session, scene)
+
+
+@pytest.fixture(scope="module")
+def results(chain: Chain, engine: Engine) -> list[FrameResult]:
+    return list(evaluate(chain, engine))
+
+
+def gap_bounds(frame: int) -> tuple[float, float]:
+    """Return how far the hull is from the face of the cube: the cones' extent in closed form.
+
+    The outlines may be off by the stairs of pixels, either way. The hull's tip stands before the
+    face, not beside it, so that the face's plane is as near as the face.
+    """
+    views = views_of(true_rig(frame))
+    opening = np.full(len(views), STAIRS_PX / FOCAL_PX)
+    axis = np.array([1.0, 0.0, 0.0])
+    face_m = -HALF_M - X_M[frame]
+    extents = [
+        ball_extent(views, CENTERS[frame], RADIUS_M, axis, side * opening) for side in (1, -1)
+    ]
+    return face_m - extents[0], face_m - extents[1]
+
+
+def test_clearance_and_certificate_are_those_of_the_cones_where_the_cameras_were(
+    results: list[FrameResult],
+) -> None:
+    verdicts = []
+    for result in results:
+        if result.index == LOST:
+            continue
+        (finding,) = result.findings
+        lower_m, upper_m = gap_bounds(result.index)
+        assert finding.clearance is not None
+        assert finding.clearance.lower_m <= max(0.0, upper_m)
+        assert finding.clearance.upper_m >= max(0.0, lower_m)
+        assert upper_m - lower_m < 0.02
+        if lower_m > 0:
+            assert finding.contact.certificate == "free"
+        if upper_m < 0:
+            assert finding.contact.certificate == "colliding"
+            assert finding.contact.collides
+        verdicts.append(finding.contact.certificate)
+    assert verdicts == ["free", "free", "free", "free", "colliding", "colliding", "free"]
+
+
+def test_leaving_out_the_motion_gives_a_wrong_answer(
+    session: Path, scene: Path, engine: Engine, tmp_path: Path
+) -> None:
+    still = write_session(tmp_path, poses="")
+    rig = true_rig(0)
+    write_rig(tmp_path / "rig" / "rig.json", Rig(rig.cameras))
+
+    found = list(evaluate(chain_of(still, scene, doubt=None, response=None), engine))
+
+    # Frame 0 is right. In frame 5 the ball is deep in the cube, and by the head's cone, which
+    # stands where it stood in frame 0, nothing is near.
+    (first,), (fifth,) = found[0].findings, found[5].findings
+    assert first.clearance is not None
+    assert fifth.clearance is not None
+    assert first.clearance.lower_m <= gap_bounds(0)[1]
+    assert first.clearance.upper_m >= gap_bounds(0)[0]
+    assert gap_bounds(5)[1] < -0.1
+    assert fifth.contact.certificate == "free"
+    assert fifth.clearance.lower_m > 0.05
+
+
+def test_a_frame_without_a_tracked_pose_is_a_row_with_the_reason(
+    results: list[FrameResult],
+) -> None:
+    reasons = [result.reason for result in results]
+
+    assert reasons[LOST] == f"no tracked pose of camera 'head' in frame {LOST}"
+    assert results[LOST].findings == ()
+    assert [bool(reason) for reason in reasons] == [k == LOST for k in range(len(CENTERS))]
+
+
+def test_first_contact_lies_where_both_the_ball_and_the_camera_were_on_their_way(
+    results: list[FrameResult],
+) -> None:
+    (finding,) = results[4].findings
+    assert finding.first_contact is not None
+    before, after = gap_bounds(3), gap_bounds(4)
+    # The gap closes about evenly between the frames.
+    earliest = before[0] / (before[0] - after[0])
+    latest = before[1] / (before[1] - after[1])
+
+    assert finding.first_contact.status == ""
+    assert earliest - 0.15 < finding.first_contact.fraction < latest + 0.15
+    np.testing.assert_allclose(finding.first_contact.point_world, [-HALF_M, 0, 0], atol=0.03)
+
+
+def numbers(result: FrameResult) -> list[Any]:
+    """Return what a frame says, to be compared to the bit."""
+    said: list[Any] = [result.index, result.reason]
+    for one in result.findings:
+        assert one.clearance is not None
+        said += [one.contact.certificate, one.contact.points_world.tolist()]
+        said += [one.clearance.lower_m, one.clearance.upper_m, str(one.approach_m_s)]
+        said += [str(one.first_contact), str(one.response), str(one.doubt)]
+    return said
+
+
+def test_a_run_that_is_taken_up_says_the_same_to_the_bit(
+    chain: Chain, engine: Engine, results: list[FrameResult]
+) -> None:
+    for skip in (3, 5, LOST + 1):
+        rest = list(evaluate(chain, engine, skip=skip))
+
+        assert [numbers(one) for one in rest] == [numbers(one) for one in results[skip:]]
+
+
+def test_the_local_origin_is_that_of_the_whole_recording(
+    session: Path, scene: Path, chain: Chain
+) -> None:
+    from hybridve.hull.capture.recording import FrameRange
+
+    late = chain_of(session, scene, frames=FrameRange(4))
+
+    origins = [views_at(chain, frame).origin_world for frame in (0, 4, 7)]
+    for origin in [*origins, views_at(late, 4).origin_world]:
+        np.testing.assert_array_equal(origin, chain.views.origin_world)
+    for frame in (0, 4):
+        views = views_at(chain, frame)
+        expected = views_of(true_rig(frame))
+        moved = expected.img_from_local.copy()
+        shift = views.origin_world - expected.origin_world
+        moved[:, :, 3] += moved[:, :, :3] @ shift
+        np.testing.assert_allclose(views.img_from_local, moved, atol=1e-9)
+        # What stands still does so to the bit.
+        np.testing.assert_array_equal(views.img_from_local[:3], chain.views.img_from_local[:3])
+
+
+@pytest.mark.gl
+def test_engines_that_keep_things_from_frame_to_frame_agree(chain: Chain, engine: Engine) -> None:
+    from hybridve.hull.query.compute import Compute
+    from hybridve.hull.query.device import open_device
+    from hybridve.hull.query.stencil import Stencil
+
+    plain = replace(
+        chain, settings=replace(chain.settings, clearance_m=None, response=None, open_at_m=None)
+    )
+    expected = [
+        [one.contact.triangle.tolist() for one in result.findings]
+        for result in evaluate(plain, engine)
+    ]
+    assert any(triangles for frame in expected for triangles in frame)
+    context = open_device()
+    for kind in (Compute, Stencil):
+        with kind(context) as other:
+            found = [
+                [one.contact.triangle.tolist() for one in result.findings]
+                for result in evaluate(plain, other)
+            ]
+        assert found == expected
+    context.release()
+
+
+def test_other_poses_are_other_settings(
+    session: Path, scene: Path, chain: Chain, tmp_path: Path
+) -> None:
+    other = write_session(tmp_path)
+    (tmp_path / "head.csv").write_text(
+        poses_csv({k: tracked(head_pose(k)) for k in range(8)}), encoding="utf-8"
+    )
+
+    first, second = resolved_settings(chain), resolved_settings(chain_of(other, scene))
+
+    assert first["poses_sha256"]["head"] != second["poses_sha256"]["head"]
+
+
+def test_stored_silhouettes_serve_until_the_poses_change(
+    scene: Path, tmp_path: Path, run: Run, engine: Engine, results: list[FrameResult]
+) -> None:
+    path = write_session(tmp_path)
+    # Something that the head alone sees, in one frame; the others see nothing there.
+    stray = tmp_path / "head" / "4.png"
+    picture = cv2.imread(str(stray), cv2.IMREAD_GRAYSCALE)
+    picture[5:15, 5:15] = 255
+    cv2.imwrite(str(stray), picture)
+
+    assert run("segment", path, "--no-progress") == 0
+    stored = chain_of(path, scene)
+    found = list(evaluate(stored, engine))
+    head = tmp_path / "head.csv"
+    head.write_text(head.read_text(encoding="utf-8").replace("\n0,", "\n00,"), encoding="utf-8")
+
+    assert stored.silhouettes is not None
+    assert [numbers(one) for one in found] == [numbers(one) for one in results]
+    from hybridve.hull.capture.silhouette_io import SilhouetteReader
+
+    with SilhouetteReader(tmp_path / "silhouettes.h5") as reader:
+        masks, _ = reader.frame(4)
+        lost, _ = reader.frame(LOST)
+    assert masks is not None
+    assert lost is not None
+    assert masks[3][5:15, 5:15].sum() == 0
+    assert masks[3].sum() == (picture > 0).sum() - 100
+    assert (
+        stored_silhouettes(load_session(path), rig_digest(read_rig(tmp_path / "rig" / "rig.json")))
+        is None
+    )
+
+
+def test_spacing_sweep_and_pictures_see_the_cameras_where_they_were(
+    chain: Chain, scene: Path, engine: Engine
+) -> None:
+    hulls = read_hulls(chain)
+    move = Move(np.array([1.0, 0.0, 0.0]), 0.0, 0.6, 1e-3)
+    shifts = np.linspace(0.0, 0.6, 7)
+    spacing = replay("head", chain, Layout.of(chain.scene, ["cube"], move), shifts)
+
+    assert [frame.index for frame in hulls] == [k for k in range(len(CENTERS)) if k != LOST]
+    for frame in hulls:
+        np.testing.assert_array_equal(
+            frame.hull.views.img_from_local, views_at(chain, frame.index).img_from_local
+        )
+    # The cube has to give way until the hull of frame 5, the deepest, is out of it.
+    lower_m, upper_m = gap_bounds(5)
+    assert -upper_m - 2e-3 < spacing.shift_m < -lower_m + 2e-3
+    assert spacing.frames.reason[LOST].startswith("no tracked pose of camera 'head'")
+
+    shot = take_shot(chain, 5, engine)
+    np.testing.assert_allclose(shot.rig["head"].cam_from_world, head_pose(5), atol=1e-12)
+    assert shot.contacts[0].collides
+    assert draw_cameras(shot).size > 0
+    assert draw_scene(shot, (320, 240)).size > 0
+    with pytest.raises(SessionError, match=f"frame {LOST}: no tracked pose of camera 'head'"):
+        take_shot(chain, LOST, engine)
+
+
+def test_a_clock_that_began_late_moves_the_poses_too(tmp_path: Path, scene: Path) -> None:
+    path = write_session(tmp_path, poses='poses = "head.csv"\noffset_s = 0.08')
+
+    late = chain_of(path, scene)
+
+    assert late.tracks.first == 2
+    np.testing.assert_allclose(late.tracks.at(3)["head"], tracked(head_pose(1)), atol=1e-12)
+    assert late.tracks.missing(LOST + 2) == f"no tracked pose of camera 'head' in frame {LOST + 2}"
+
+
+def test_what_does_not_fit_together_is_told_by_name(tmp_path: Path, scene: Path) -> None:
+    path = write_session(tmp_path, poses="")
+    with pytest.raises(
+        SessionError, match=r"camera.4 \('head'\) moves with a tracker, says the rig"
+    ):
+        chain_of(path, scene)
+
+    write_session(tmp_path)
+    write_rig(tmp_path / "rig" / "rig.json", Rig(true_rig(0).cameras))
+    with pytest.raises(CalibrationError, match=r"camera.4.poses: the rig does not say where"):
+        chain_of(path, scene)
+
+    rig = true_rig(0)
+    write_rig(
+        tmp_path / "rig" / "rig.json", Rig(rig.cameras, mounts={"head": MOUNT, "cam0": MOUNT})
+    )
+    (tmp_path / "cam0.csv").write_text(poses_csv({99: MOUNT.cam_from_tracker}), encoding="utf-8")
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('"cam0/*.png"', '"cam0/*.png"\nposes = "cam0.csv"'), "utf-8")
+    with pytest.raises(SessionError, match="no frame has a tracked pose of all of cam0, head"):
+        chain_of(path, scene)
+
+
+# --- views between two frames ---------------------------------------------------------------------
+
+
+def centers_of(views: Views) -> NDArray[np.float64]:
+    matrices = views.img_from_local
+    return -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0]
+
+
+def test_between_two_frames_a_camera_goes_straight_and_turns_evenly(chain: Chain) -> None:
+    before, after = views_at(chain, 1), views_at(chain, 2)
+
+    middle = interpolated_views(before, after, 0.25)
+
+    assert interpolated_views(before, after, 0.0) is before
+    assert interpolated_views(before, after, 1.0) is after
+    assert interpolated_views(before, before, 0.25) is before
+    np.testing.assert_array_equal(middle.img_from_local[:3], before.img_from_local[:3])
+    np.testing.assert_allclose(
+        centers_of(middle), 0.75 * centers_of(before) + 0.25 * centers_of(after), atol=1e-12
+    )
+
+    def turned(first: Views, second: Views) -> NDArray[np.float64]:
+        rotation = np.linalg.solve(first.img_from_local[3, :, :3], second.img_from_local[3, :, :3])
+        return cv2.Rodrigues(rotation)[0].ravel()
+
+    np.testing.assert_allclose(turned(before, middle), 0.25 * turned(before, after), atol=1e-9)
+    assert np.linalg.norm(turned(before, after)) > 0.1
+
+
+def test_views_of_other_cameras_have_nothing_between_them() -> None:
+    views = ring_views(3)
+    for other in (
+        ring_views(4),
+        ring_views(3, width=640),
+        ring_views(3, focal_px=701.0),
+        ring_views(3, unseen="keep"),
+        replace(views, origin_world=views.origin_world + 1.0),
+    ):
+        with pytest.raises(ValueError, match="not of the same views"):
+            interpolated_views(views, other, 0.5)
+
+
+def test_hulls_of_standing_cameras_have_the_very_views_of_the_chain(
+    tmp_path: Path, scene: Path
+) -> None:
+    path = write_session(tmp_path, poses="")
+    write_rig(tmp_path / "rig" / "rig.json", Rig(true_rig(0).cameras))
+
+    still = chain_of(path, scene)
+
+    assert not still.tracks
+    assert "poses_sha256" not in resolved_settings(still)
+    assert views_at(still, 5) is still.views
+    assert make_hull(views_at(still, 2), ball_masks(still.views, CENTERS[2], RADIUS_M))
