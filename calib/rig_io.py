@@ -616,18 +616,16 @@ def _pick(cameras: Sequence[Camera | ForeignCamera], name: str, pattern: str) ->
 
 def _names_on_disk(source: Path) -> list[str]:
     """Return the names that the placeholder stands for, of the files there are, as people sort."""
-    before, _, after = str(source).partition(PLACEHOLDER)
-    folder = Path(before if before.endswith("/") else before.rpartition("/")[0] or ".")
-    prefix = "" if before.endswith("/") else before.rpartition("/")[2]
-    inside, _, rest = after.partition("/")
+    first = next(index for index, part in enumerate(source.parts) if PLACEHOLDER in part)
+    folder = Path(*source.parts[:first])
+    pieces = [re.escape(piece) for piece in source.parts[first].split(PLACEHOLDER)]
+    again = r"(?:\1)".join(pieces[1:])  # the same name wherever the placeholder stands
+    pattern = re.compile(f"{pieces[0]}(.+?){again}")
     names = []
     for entry in folder.iterdir() if folder.is_dir() else ():
-        if not (entry.name.startswith(prefix) and entry.name.endswith(inside)):
-            continue
-        name = entry.name[len(prefix) : len(entry.name) - len(inside)]
-        path = entry / rest.replace(PLACEHOLDER, name) if rest else entry
-        if name and path.is_file():
-            names.append(name)
+        match = pattern.fullmatch(entry.name)
+        if match and Path(str(source).replace(PLACEHOLDER, match.group(1))).is_file():
+            names.append(match.group(1))
     if not names:
         raise CalibrationError(f"{source}: there is no such file for any camera")
     return sorted(

@@ -14,8 +14,8 @@ from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.colmap_io import read_colmap_model, write_colmap_model
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam, project_points
-from hybridve.calib.pose import angle_between
-from hybridve.calib.rig import Rig
+from hybridve.calib.pose import angle_between, compose, transform
+from hybridve.calib.rig import Mount, Rig, RigCovariance
 from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict, write_rig
 from hybridve.calib.target import Chessboard
 
@@ -151,6 +151,119 @@ def test_our_own_rig_is_taken_as_it_is(tmp_path: Path, rig: Rig) -> None:
     taken = import_rig(tmp_path, "rig.json", "mm", 0.0, SIZES, None)
 
     assert rig_to_dict(taken) == rig_to_dict(rig)
+
+
+# --- What is known about a rig, and cameras that move -------------------------------------------
+
+
+def covered(rig: Rig) -> Rig:
+    labels = tuple(f"{c.name} {p}" for c in rig.cameras for p in range(6 + len(c.params)))
+    root = np.random.default_rng(0).normal(size=(len(labels), len(labels)))
+    mount = Mount(look_at((1.0, 2, 3), (0, 0, 0)), look_at((3.0, 1, 2), (0, 0, 1)))
+    return Rig(rig.cameras, rig.provenance, RigCovariance(labels, root @ root.T), {"cam2": mount})
+
+
+def test_covariance_and_mounts_are_read_back_to_the_bit(tmp_path: Path, rig: Rig) -> None:
+    whole = covered(rig)
+    write_rig(tmp_path / "rig.json", whole)
+    again = read_rig(tmp_path / "rig.json")
+
+    assert again.covariance is not None
+    assert whole.covariance is not None
+    np.testing.assert_array_equal(again.covariance.matrix, whole.covariance.matrix)
+    assert again.covariance.labels == whole.covariance.labels
+    assert list(again.mounts) == ["cam2"]
+    for name in ("cam_from_tracker", "world_from_tracking"):
+        np.testing.assert_array_equal(
+            getattr(again.mounts["cam2"], name), getattr(whole.mounts["cam2"], name)
+        )
+
+
+def test_a_rig_of_before_has_neither(tmp_path: Path, rig: Rig) -> None:
+    write_rig(tmp_path / "rig.json", rig)
+    content = json.loads((tmp_path / "rig.json").read_text())
+
+    assert "covariance" not in content
+    assert "mounts" not in content
+    assert read_rig(tmp_path / "rig.json").covariance is None
+    assert not read_rig(tmp_path / "rig.json").mounts
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "found"),
+    [
+        (("covariance", "labels"), ["cam1 rx"], r"shape \(20, 20\), expected \(1, 1\)"),
+        (("covariance", "labels"), [f"cam1 {p}" for p in range(20)], "not that of its cameras"),
+        (("covariance", "matrix", 3), [1.0], r"row 4 of the covariance has shape \(1,\)"),
+        (("covariance", "matrix", 0), [-1.0], "'cam1 0' has the variance -1"),
+        (("covariance", "matrix", 0), [float("nan")], "finite numbers"),
+        (("covariance", "labels"), None, "or the covariance"),
+        (("mounts", "cam2", "cam_from_tracker"), [[2, 0, 0, 0]] * 3, "not a rotation"),
+        (("mounts", "cam2", "world_from_tracking"), [1.0], r"expected \(3, 4\)"),
+        (("mounts", "cam2", "cam_from_tracker"), None, "'cam_from_tracker', or a mount"),
+        (
+            ("mounts",),
+            {
+                "cam9": {
+                    "cam_from_tracker": np.eye(3, 4).tolist(),
+                    "world_from_tracking": np.eye(3, 4).tolist(),
+                }
+            },
+            "mount for 'cam9'",
+        ),
+        (("mounts",), [1], "expected hybridve-rig 1"),
+    ],
+)
+def test_damage_to_them_is_named(
+    tmp_path: Path, rig: Rig, keys: tuple[object, ...], value: object, found: str
+) -> None:
+    content = json.loads(json.dumps(rig_to_dict(covered(rig))))
+    spoil(content, *keys, value=value)
+    (tmp_path / "rig.json").write_text(json.dumps(content))
+
+    with pytest.raises(CalibrationError, match=found):
+        read_rig(tmp_path / "rig.json")
+
+
+def test_a_covariance_that_is_not_symmetric_is_refused() -> None:
+    matrix = np.diag([1.0, 1e-12])
+    matrix[0, 1] = 1e-8  # large against the deviations 1 and 1e-6 that it couples
+
+    with pytest.raises(CalibrationError, match="not symmetric"):
+        RigCovariance(("a rx", "a ry"), matrix)
+
+
+def test_a_tracked_camera_goes_with_its_tracker(rig: Rig) -> None:
+    whole = covered(rig)
+    mount = whole.mounts["cam2"]
+    tracking_from_tracker = look_at((0.3, -1.0, 0.2), (1, 1, 1))
+    points_tracker = points()
+    # The same points by the other way round: tracker, its world, ours, camera.
+    points_world = transform(
+        compose(mount.world_from_tracking, tracking_from_tracker), points_tracker
+    )
+
+    moved = whole.at({"cam2": tracking_from_tracker})
+
+    np.testing.assert_allclose(
+        transform(moved["cam2"].cam_from_world, points_world),
+        transform(mount.cam_from_tracker, points_tracker),
+        atol=1e-12,
+    )
+    assert moved["cam1"] is whole["cam1"]
+    assert moved.covariance is whole.covariance
+    assert moved["cam2"].params.tolist() == whole["cam2"].params.tolist()
+    with pytest.raises(CalibrationError, match=r"'cam1' has no mount .* cameras: cam2"):
+        whole.at({"cam1": tracking_from_tracker})
+
+
+def test_cameras_that_a_rig_lacks_cannot_be_taken_from_it(rig: Rig) -> None:
+    with pytest.raises(CalibrationError, match="no camera 'cam3'"):
+        covered(rig).only(["cam1", "cam3"])
+    with pytest.raises(CalibrationError, match="2 times"):
+        covered(rig).only(["cam1", "cam1"])
+    with pytest.raises(CalibrationError, match="no camera"):
+        covered(rig).only([])
 
 
 # --- Rows of matrices -------------------------------------------------------------------------

@@ -23,9 +23,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats import opencv_lens
@@ -34,6 +31,7 @@ from hybridve.calib.formats.foreign import (
     ForeignRig,
     as_size,
     read_text,
+    rotation_vector,
     translation_in,
 )
 
@@ -93,7 +91,7 @@ def _fisheye(camera: Camera) -> str:
 
 def _lines(camera: Camera, unit_m: float) -> list[str]:
     lens = opencv_lens.opencv_lens(camera)
-    rotation = np.asarray(cv2.Rodrigues(camera.cam_from_world[:, :3])[0]).ravel()
+    rotation = rotation_vector(camera.cam_from_world[:, :3])
     return [
         f"size = [{camera.width_px}, {camera.height_px}]",
         f"matrix = {lens.matrix.tolist()}",

@@ -22,7 +22,12 @@ import numpy as np
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats import opencv_lens
-from hybridve.calib.formats.foreign import ForeignCamera, ForeignRig, translation_in
+from hybridve.calib.formats.foreign import (
+    ForeignCamera,
+    ForeignRig,
+    rotation_vector,
+    translation_in,
+)
 
 #: How files of OpenCV's kind spell what they hold, in lower case without "_", "-" and blanks.
 _KEYS = {
@@ -71,7 +76,7 @@ def write_opencv(camera: Camera, suffix: str, unit_m: float) -> str:
     storage.write("camera_matrix", lens.matrix)
     storage.write("distortion_coefficients", distortion[None])
     storage.write("R", rotation)
-    storage.write("rvec", np.asarray(cv2.Rodrigues(rotation)[0]))
+    storage.write("rvec", rotation_vector(rotation)[:, None])
     storage.write("tvec", np.array([translation_in(camera, unit_m)]).T)
     return storage.releaseAndGetString()
 
