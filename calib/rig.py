@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -157,7 +156,7 @@ class Rig:
                 raise CalibrationError(
                     f"the rig has a mount for {name!r}, but its cameras are {', '.join(names)}"
                 )
-        object.__setattr__(self, "mounts", MappingProxyType(dict(self.mounts)))
+        object.__setattr__(self, "mounts", dict(self.mounts))  # a private copy
         if self.covariance is not None:
             owners = [label.rpartition(" ")[0] for label in self.covariance.labels]
             expected = [
