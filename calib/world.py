@@ -432,8 +432,8 @@ def _triangulated(
         if not np.isfinite(points[index]).all():
             raise CalibrationError(
                 f"point {mark.name!r}: the rays of {', '.join(map(repr, names))} do not meet "
-                "before them; is it clicked at the same place in each picture, and are the cameras far "
-                "enough apart?"
+                "before them; is it clicked at the same place in each picture, and are the cameras "
+                "far enough apart?"
             )
         misses[mark.name] = dict(zip(names, map(float, missed_px), strict=True))
     return points, misses
