@@ -343,6 +343,39 @@ def pixel_covariance(rig: Rig, points_world: NDArray[np.float64]) -> NDArray[np.
     return found
 
 
+def undistorted_covariance(rig: Rig, point_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance of where the cameras see a point in images freed of distortion.
+
+    Parameters
+    ----------
+    rig : Rig
+        With its covariance.
+    point_world : (3,) float64
+        A point in metres.
+
+    Returns
+    -------
+    (C, 2, C, 2) float64
+        Pixels squared of pinhole images with the lenses' focal lengths
+        (`hybridve.calib.lens.undistortion`); NaN where a camera does not see the point.
+
+    Raises
+    ------
+    ValueError
+        If the rig has no covariance.
+    """
+    covariance = pixel_covariance(rig, point_world[None])[0]
+    for index, camera in enumerate(rig.cameras):
+        if not camera.has_distortion or not np.isfinite(covariance[index, 0, index, 0]):
+            continue
+        point_cam = transform(camera.cam_from_world, point_world[None])
+        by_ray = lens_derivatives(camera, point_cam)[0][0, :, :2] * point_cam[0, 2]
+        undistorted_from_seen = camera.pinhole[:2, :2] @ np.linalg.inv(by_ray)
+        covariance[index] = np.tensordot(undistorted_from_seen, covariance[index], axes=1)
+        covariance[:, :, index] = covariance[:, :, index] @ undistorted_from_seen.T
+    return np.asarray(covariance)
+
+
 def _matrix(rig: Rig) -> NDArray[np.float64]:
     if rig.covariance is None:
         raise ValueError("the rig has no covariance")

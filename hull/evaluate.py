@@ -321,7 +321,12 @@ class _Tools:
 
             names, shift_px = chain.views.names, _mask_shift_px(chain)
             errors = outline_errors(
-                names, chain.rig.provenance, [shift_px[name] for name in names], settings.doubt
+                names,
+                chain.rig.provenance,
+                [shift_px[name] for name in names],
+                settings.doubt,
+                # A covariance holds where cameras stand still.
+                chain.rig if not chain.rig.mounts else None,
             )
             doubter = Doubter(errors, settings.doubt)
         with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:

@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.boards import look_at, make_camera
 from helpers.cones import BOX_FACES, ball_extent, box_vertices, hull_of_balls, plate, views_from
 from helpers.hulls import ball_hull, ball_masks, ring_views
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from hybridve.calib.bundle import moved_pose
+from hybridve.calib.camera import Camera
+from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.uncertainty import (
@@ -22,7 +26,7 @@ from hybridve.hull.contact.uncertainty import (
     without_camera,
 )
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 
 FREE = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
 
@@ -107,8 +111,8 @@ def test_a_cone_moves_by_the_pixel_of_its_depth() -> None:
     # (600 px beside the middle would be 71.6), sideways moves are seen foreshortened.
     views = views_from([np.array([0.0, -4.0, 0.0])], focal_px=200.0)
 
-    ahead = metres_per_pixel(views, 0, np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    beside = metres_per_pixel(
+    ahead, _ = metres_per_pixel(views, 0, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    beside, _ = metres_per_pixel(
         views, 0, np.array([4.0, 0.0, 0.0]), np.array([1.0, -1.0, 0.0]) / 2**0.5
     )
 
@@ -169,6 +173,76 @@ def test_the_true_hull_is_at_least_so_far_away_in_95_percent_of_recordings() -> 
     assert sum(covered) >= binom.ppf(0.001, len(covered), 0.95)
     # Nor is the doubt larger than need be: errors are what it says they are, within a third.
     assert 0.67 < np.std(pulls) < 1.33
+
+
+def test_a_rig_that_knows_its_covariance_tells_how_clearances_scatter() -> None:
+    """Cameras that err together: the hull of where they are thought to be, over many rigs."""
+    rng = np.random.default_rng(8)
+    center, radius_m, n_cameras = np.array([0.05, 0.0, 0.1]), 0.2, 4
+    cameras = [
+        make_camera(
+            f"cam{number}",
+            "PINHOLE",
+            look_at((3.0 * np.cos(a), 3.0 * np.sin(a), 0.8), (0.0, 0.0, 0.0)),
+        )
+        for number, a in enumerate(2.0 * np.pi * (np.arange(n_cameras) + 0.2) / n_cameras)
+    ]
+    size = 10 * n_cameras
+    # Errors that all cameras share (they turn alike about the vertical), and some of their own.
+    shared = np.zeros((size, 1))
+    for number, camera in enumerate(cameras):
+        axis = camera.cam_from_world[:, :3] @ [0.0, 0.0, 1.0]
+        at = camera.cam_from_world[:, 3]
+        shared[10 * number : 10 * number + 6, 0] = 0.002 * np.concatenate(
+            [axis, -np.cross(axis, at)]
+        )
+        shared[10 * number + 1, 0] += 0.001
+    own = np.tile([0.0004, 0.0004, 0.0004, 0.001, 0.001, 0.001, 0.5, 0.5, 0.3, 0.3], n_cameras)
+    rig = Rig(
+        tuple(cameras),
+        covariance=RigCovariance(
+            tuple(f"cam{index // 10} {index % 10}" for index in range(size)),
+            shared @ shared.T + np.diag(own**2),
+        ),
+    )
+    normal = np.array([0.8, 0.3, 0.2]) / np.linalg.norm([0.8, 0.3, 0.2])
+    meter = ClearanceMeter(*plate(center + 0.4 * normal, normal), is_closed=False, tolerance_m=2e-4)
+    names = tuple(camera.name for camera in cameras)
+    found_m, stated_m = [], []
+    errors = outline_errors(names, {}, [0.0] * n_cameras, DoubtSettings(segmentation_px=0.0), rig)
+    believed = _views_of(cameras)
+    for _ in range(60):
+        change = shared[:, 0] * rng.normal() + own * rng.normal(size=size)
+        true = [_changed(camera, change[10 * k : 10 * k + 10]) for k, camera in enumerate(cameras)]
+        hull = make_hull(believed, ball_masks(_views_of(true), center, radius_m))
+        clearance = meter.measure(hull)
+        sensitivity_m, _, normals_px = Doubter(errors).frame(hull).sensitivity(meter, clearance)
+        variance = errors.calibration_variance_m2(
+            clearance.on_hull_world, sensitivity_m, normals_px
+        )
+        found_m.append(clearance.upper_m)
+        stated_m.append(np.sqrt(variance))
+
+    import sys
+
+    sys.stderr.write(f"{np.std(found_m)} {np.mean(stated_m)} {np.mean(found_m)}\n")
+    # 60 draws tell a standard deviation to 9 %; pixels add 0.3 px each, which is little here.
+    assert np.std(found_m) == pytest.approx(np.sqrt(np.mean(np.square(stated_m))), rel=0.35)
+    # Taken to be independent, the same images would scatter otherwise.
+    assert errors.sigma_px == pytest.approx(np.full(n_cameras, errors.quantisation_px))
+
+
+def _views_of(cameras: list[Camera]) -> Views:
+    return make_views(
+        tuple(camera.name for camera in cameras),
+        np.array([(camera.width_px, camera.height_px) for camera in cameras]),
+        np.array([camera.pinhole @ camera.cam_from_world for camera in cameras]),
+    )
+
+
+def _changed(camera: Camera, change: NDArray[np.float64]) -> Camera:
+    pose = moved_pose(camera.cam_from_world, change[:6])
+    return replace(camera, cam_from_world=pose, params=camera.params + change[6:])
 
 
 def _disturbed(

@@ -42,14 +42,18 @@ the signed clearance falls as the depth grows.
 
 What moves an outline
 ---------------------
-Per camera, in pixels, taken to be independent from camera to camera: `OutlineErrors`. Independent,
-they add up in squares: ``std_m ** 2 = sum (m_per_px[k] * sigma_px[k]) ** 2``. The lower bound less
-1.645 of these is what the clearance is at least, at 95 % on one side.
+Per camera, in pixels: `OutlineErrors`. Segmentation, undistortion and rounding are independent from
+camera to camera and add up in squares: ``sum (m_per_px[k] * sigma_px[k]) ** 2``. The calibration is
+not: cameras that were placed by one board err together. A rig that knows its covariance
+(`hybridve.calib.uncertainty`) tells that of the images (e_1, .., e_C) of the point x; with n_k the
+outline's outward normal in image k, the clearance errs by ``sum m_per_px[k] n_k . e_k``, whose
+variance follows. Other rigs tell how far they missed the corners of their board, which stands for
+an independent error. The lower bound less 1.645 standard deviations is what the clearance is at
+least, at 95 % on one side.
 
 What is not in it: a silhouette that is wrong by more than its outline (a hand cut off, a chair that
 was not there before) has no standard deviation; the last numbers, of cameras left out, tell what
-hangs on one silhouette. A covariance of the poses is not known to any rig so far; how far its
-corners were missed stands in for it.
+hangs on one silhouette.
 """
 
 from collections.abc import Mapping, Sequence
@@ -61,6 +65,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from hybridve.calib.rig import Rig
+from hybridve.calib.uncertainty import undistorted_covariance
 from hybridve.hull.contact.bulge import real_upper
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.components import (
@@ -143,21 +149,55 @@ class OutlineErrors:
         Of the outline in the image.
     lens_px : (C,) float64
         Of undistorting the silhouette, whose shift is bounded: even within that bound.
+    rig : Rig or None
+        The cameras' rig, if it knows its covariance; `calibration_px` is not used then.
     """
 
     calibration_px: NDArray[np.float64]
     is_measured: NDArray[np.bool_]
     segmentation_px: float
     lens_px: NDArray[np.float64]
+    rig: Rig | None = None
 
     #: Of an outline that is rounded to whole pixels: even within half a pixel.
     quantisation_px = 1.0 / np.sqrt(12.0)
 
     @property
     def sigma_px(self) -> NDArray[np.float64]:
-        """All of it together, (C,)."""
-        variance = self.calibration_px**2 + self.lens_px**2
-        return np.asarray(np.sqrt(variance + self.segmentation_px**2 + self.quantisation_px**2))
+        """All of it together, but the rig's covariance: (C,)."""
+        variance = self.lens_px**2 + self.segmentation_px**2 + self.quantisation_px**2
+        if self.rig is None:
+            variance = variance + self.calibration_px**2
+        return np.asarray(np.sqrt(variance))
+
+    def calibration_variance_m2(
+        self,
+        point_world: NDArray[np.float64],
+        m_per_px: NDArray[np.float64],
+        normals_px: NDArray[np.float64],
+    ) -> float:
+        """Return the variance that the rig's covariance gives a clearance; 0 without one.
+
+        Parameters
+        ----------
+        point_world : (3,) float64
+            The hull's nearest point, metres.
+        m_per_px : (C,) float64
+            How far the clearance falls as each camera's outline moves outward by a pixel.
+        normals_px : (C, 2) float64
+            The outlines' outward normals in the images, unit vectors; NaN where not known: the
+            error is taken to be that along either axis, independent of other cameras.
+        """
+        if self.rig is None or not m_per_px.any():
+            return 0.0
+        covariance = np.nan_to_num(undistorted_covariance(self.rig, point_world))
+        is_known = np.asarray(np.isfinite(normals_px).all(axis=1))
+        weights = np.where(is_known[:, None], m_per_px[:, None] * normals_px, 0.0)
+        variance = np.einsum("ki,kilj,lj->", weights, covariance, weights)
+        for camera in np.flatnonzero(~is_known):
+            spread_px2 = np.trace(covariance[camera, :, camera]) / 2.0
+            variance += m_per_px[camera] ** 2 * spread_px2
+        return max(0.0, float(variance))
 
 
 def outline_errors(
@@ -165,6 +205,7 @@ def outline_errors(
     provenance: Mapping[str, Any],
     mask_shift_px: Sequence[float | None],
     settings: DoubtSettings | None = None,
+    rig: Rig | None = None,
 ) -> OutlineErrors:
     """Return how far outlines may be off, as far as the rig tells.
 
@@ -181,6 +222,8 @@ def outline_errors(
         Bounds of `hybridve.calib.lens_bound`; None where there is none, which counts as a pixel.
     settings : DoubtSettings, optional
         What is assumed where the rig does not tell.
+    rig : Rig, optional
+        The rig; its covariance is used if it has one.
     """
     settings = settings or DoubtSettings()
     missed_px = np.array([_missed_px(provenance, name) for name in names])
@@ -191,6 +234,7 @@ def outline_errors(
         is_measured,
         settings.segmentation_px,
         shift_px / np.sqrt(3.0),
+        rig.only(names) if rig is not None and rig.covariance is not None else None,
     )
 
 
@@ -319,8 +363,13 @@ class FrameDoubts:
         required_m : float
             The clearance that the object requires.
         """
-        sensitivity_m, is_remeasured = self.sensitivity(meter, clearance)
-        std_m = float(np.sqrt(((sensitivity_m * self.errors.sigma_px) ** 2).sum()))
+        sensitivity_m, is_remeasured, normals_px = self.sensitivity(meter, clearance)
+        variance_m2 = float(((sensitivity_m * self.errors.sigma_px) ** 2).sum())
+        if np.isfinite(variance_m2):
+            variance_m2 += self.errors.calibration_variance_m2(
+                clearance.on_hull_world, sensitivity_m, normals_px
+            )
+        std_m = float(np.sqrt(variance_m2))
         touching_world = _touching_points(contact)
         points_world = touching_world
         if len(points_world) == 0 and np.isfinite(clearance.on_hull_world).all():
@@ -356,25 +405,35 @@ class FrameDoubts:
 
     def sensitivity(
         self, meter: ClearanceMeter, clearance: Clearance
-    ) -> tuple[NDArray[np.float64], bool]:
-        """Return metres per pixel (C,), and whether they were measured anew."""
+    ) -> tuple[NDArray[np.float64], bool, NDArray[np.float64]]:
+        """Return metres per pixel (C,), whether they were measured anew, and outlines' normals.
+
+        The normals (C, 2) are unit vectors in the images, NaN where not known.
+        """
         n_cameras = len(self.hull.views)
+        unknown = np.full((n_cameras, 2), np.nan)
         toward = clearance.on_object_world - clearance.on_hull_world
         distance_m = float(np.linalg.norm(toward))
         if not distance_m > _NO_DIRECTION_M:  # or NaN
-            return np.full(n_cameras, np.nan), False
+            return np.full(n_cameras, np.nan), False, unknown
         is_inside = clearance.upper_m <= 0 and clearance.depth_lower_m > 0
         direction = toward / (-distance_m if is_inside else distance_m)
-        sensitivity_m, residual = outline_sensitivity(self.hull, clearance.on_hull_world, direction)
+        sensitivity_m, residual, normals_px = outline_sensitivity(
+            self.hull, clearance.on_hull_world, direction
+        )
         if is_inside and not sensitivity_m.any():
-            return sensitivity_m, False  # the deepest point there can be: no outline ends it
+            return (
+                sensitivity_m,
+                False,
+                unknown,
+            )  # the deepest point there can be: no outline ends it
         if residual <= _MOST_RESIDUAL:
-            return sensitivity_m, False
+            return sensitivity_m, False, normals_px
         for camera in range(n_cameras):
             if _is_near_background(self.hull, camera, clearance.on_hull_world):
                 then = meter.measure(self._grown_in(camera))
                 sensitivity_m[camera] = max(0.0, clearance.signed_m[1] - then.signed_m[1])
-        return sensitivity_m, True
+        return sensitivity_m, True, unknown
 
     @cached_property
     def _both(self) -> Hull:
@@ -488,7 +547,7 @@ def without_camera(hull: Hull, camera: int) -> Hull:
 
 def outline_sensitivity(
     hull: Hull, point_world: NDArray[np.float64], direction: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
     """Return how far the hull's extreme point moves as outlines do, and how well that is explained.
 
     Parameters
@@ -507,9 +566,13 @@ def outline_sensitivity(
         pixel: ``lambda_k s_k`` of this file's head.
     residual : float
         How far the combination of normals is from the direction; 1 where no camera ends the hull.
+    normals_px : (C, 2) float64
+        The outlines' outward normals in the images, unit vectors; NaN where a camera does not end
+        the hull there.
     """
     views = hull.views
     m_per_px = np.zeros(len(views))
+    normals_px = np.full((len(views), 2), np.nan)
     cameras, normals = [], []
     for camera in range(len(views)):
         if _is_near_background(hull, camera, point_world):
@@ -518,17 +581,18 @@ def outline_sensitivity(
                 cameras.append(camera)
                 normals.append(normal)
     if not cameras:
-        return m_per_px, 1.0
+        return m_per_px, 1.0, normals_px
     multipliers, residual = nnls(np.stack(normals, axis=1), direction)
     for camera, normal, multiplier in zip(cameras, normals, multipliers, strict=True):
-        m_per_px[camera] = multiplier * metres_per_pixel(views, camera, point_world, normal)
-    return m_per_px, float(residual)
+        metres, normals_px[camera] = metres_per_pixel(views, camera, point_world, normal)
+        m_per_px[camera] = multiplier * metres
+    return m_per_px, float(residual), normals_px
 
 
 def metres_per_pixel(
     views: Views, camera: int, point_world: NDArray[np.float64], normal: NDArray[np.float64]
-) -> float:
-    """Return how far a silhouette cone moves at a point when its outline moves by one pixel.
+) -> tuple[float, NDArray[np.float64]]:
+    """Return how far a silhouette cone moves as its outline moves by a pixel, and that way.
 
     Parameters
     ----------
@@ -540,13 +604,21 @@ def metres_per_pixel(
         A point on its cone, in front of it, metres.
     normal : (3,) float64
         The cone's normal there: a unit vector across the ray.
+
+    Returns
+    -------
+    metres : float
+        Along the normal.
+    normal_px : (2,) float64
+        The outline's normal in the image, a unit vector.
     """
     matrix = views.img_from_local[camera]
     projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
     pixel = projected[:2] / projected[2]
     derivatives = (matrix[:2, :3] - pixel[:, None] * matrix[2, :3]) / projected[2]  # (2, 3)
     line, *_ = np.linalg.lstsq(derivatives.T, normal, rcond=None)
-    return float(np.linalg.norm(line))
+    metres = float(np.linalg.norm(line))
+    return metres, np.asarray(line / metres if metres > 0 else np.full(2, np.nan))
 
 
 def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64]) -> bool:
