@@ -386,6 +386,16 @@ def test_an_approximated_lens_is_as_near_as_it_says(tmp_path: Path) -> None:
     assert 0.01 < written.approximated["cam2"]["error_px"] < 2.0
 
 
+def test_a_real_lens_is_approximated_where_its_polynomial_turns_back(tmp_path: Path) -> None:
+    # Fitted to an old camera; the polynomial turns back near the corners of its image.
+    params = [494.3, 494.3, 322.0, 243.0, -0.364, 0.2014, 0.0, 0.0, -0.0723, 0.0, 0.0, 0.0]
+    camera = Camera("cam1", "FULL_OPENCV", 644, 484, np.array(params), np.eye(3, 4))
+
+    written = export_rig(Rig((camera,)), "kalibr", tmp_path / "a.yaml", approximate_lenses=True)
+
+    assert 0.1 < written.approximated["cam1"]["error_px"] < 3.0
+
+
 @pytest.mark.parametrize("to", ["opencv", "kalibr", "multical", "colmap", "aniposelib"])
 def test_a_skew_that_a_format_lacks_is_refused(tmp_path: Path, to: str) -> None:
     camera = Camera("cam1", "PINHOLE", 8, 6, np.array([9.0, 9, 4, 3]), np.eye(3, 4), 0.5)

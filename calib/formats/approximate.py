@@ -26,6 +26,9 @@ _ROUNDS = 100
 _ENOUGH_GAIN = 1e-5
 _ENOUGH_PX = 1e-6
 
+#: Further off than this, or not a number, a lens does not serve.
+_FAR_PX = 1e6
+
 #: Relative step of the derivatives.
 _STEP = 1e-6
 
@@ -58,8 +61,10 @@ def approximate(camera: Camera, models: Sequence[tuple[str, int]]) -> tuple[Came
     best: tuple[Camera, float] | None = None
     for model, n_free in models:
         candidate = _fit(camera, model, n_free, rays, pixels)
-        errors = np.linalg.norm(img_from_cam(candidate, check_rays) - check_pixels, axis=1)
-        error_px = float(errors.max()) if np.isfinite(errors).all() else float("inf")
+        errors = img_from_cam(candidate, check_rays) - check_pixels
+        error_px = float("inf")
+        if (np.abs(errors) < _FAR_PX).all():
+            error_px = float(np.linalg.norm(errors, axis=1).max())
         if best is None or error_px < best[1]:
             best = candidate, error_px
     if best is None:
@@ -78,7 +83,7 @@ def _shown(camera: Camera, steps: int) -> tuple[NDArray[np.float64], NDArray[np.
     exists = np.isfinite(rays).all(axis=1)
     again = np.full_like(grid, np.inf)
     again[exists] = img_from_cam(camera, rays[exists])
-    exists &= np.linalg.norm(np.nan_to_num(again, nan=np.inf) - grid, axis=1) < _FOLD_TOLERANCE_PX
+    exists &= (np.abs(again - grid) < _FOLD_TOLERANCE_PX).all(axis=1)  # NaN is not
     if not exists.any():
         raise CalibrationError(f"camera {camera.name!r}: its lens shows nothing anywhere")
     return rays[exists], grid[exists]
@@ -100,8 +105,8 @@ def _fit(
         return replace(camera, model=model, params=params, skew_px=0.0)
 
     def residuals(free: NDArray[np.float64]) -> NDArray[np.float64]:
-        found = img_from_cam(with_free(free), rays) - pixels
-        return np.nan_to_num(found, nan=1e6, posinf=1e6, neginf=-1e6).ravel()
+        found = np.nan_to_num(img_from_cam(with_free(free), rays) - pixels, nan=_FAR_PX)
+        return np.clip(found, -_FAR_PX, _FAR_PX).ravel()
 
     free = np.zeros(n_free)
     free[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
