@@ -35,9 +35,9 @@ from hybridve.calib.board import Board, Sighting, is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
+from hybridve.calib.lens_fit import locate_board
 from hybridve.calib.pose import Pose, angle_between, compose, invert
 from hybridve.calib.rig import Mount
-from hybridve.calib.solve import locate_board
 
 Floats = NDArray[np.float64]
 
@@ -59,9 +59,6 @@ _LEAST_TURN_DEG = 1.0
 #: A tracker that moves less than this (rad, metres) while the camera moves more than that is stuck.
 _STUCK = 1e-6
 _MOVED_RAD, _MOVED_M = 0.02, 0.01
-
-#: Corners of a seen board that are enough to say where it lies.
-_LEAST_CORNERS = 4
 
 #: Triples of pictures tried, and pictures by which each is judged.
 _TRIPLES, _JUDGES = 80, 40
@@ -294,8 +291,8 @@ def _make_views(
             untracked.add(seen.instant)
             continue
         board, pose = boards[seen.board], world_from_board[seen.board]
-        located = _locate(camera, board, seen.pixels)
-        if located is None:
+        found = locate_board(camera, board.points_board, seen.pixels)
+        if found is None:
             missed[seen.image] = "the board cannot be located"
             continue
         views.append(
@@ -307,7 +304,7 @@ def _make_views(
                 np.array([seen.pixels[look] for look in board.looks]),
                 0,
                 [
-                    compose(compose(located, board.board_from_turned(look)), invert(pose))
+                    compose(compose(found[0], board.board_from_turned(look)), invert(pose))
                     for look in range(len(board.looks))
                 ],
                 tracking_from_tracker[seen.instant],
@@ -315,14 +312,6 @@ def _make_views(
         )
     views.sort(key=lambda view: (view.instant, view.board, view.image))
     return views, missed, sorted(untracked)
-
-
-def _locate(camera: Camera, board: Board, pixels: Floats) -> Pose | None:
-    seen = is_seen(pixels)
-    if seen.sum() < _LEAST_CORNERS:
-        return None
-    found = locate_board(camera, board.points_board[seen], pixels[seen])
-    return None if found is None else found[0]
 
 
 def _without_stuck(camera: Camera, views: list[_View]) -> tuple[list[_View], dict[str, str]]:

@@ -11,13 +11,19 @@ import pytest
 from helpers.cones import ball_extent
 from helpers.hulls import ball_masks, look_at, ring_views
 from helpers.sessions import CUBE, SCENE_HEAD, SESSION_HEAD
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hybridve.calib.board import Sighting
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError, SessionError
-from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.hand_eye import mount_camera
+from hybridve.calib.lens import img_from_cam
+from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.rig import Mount, Rig
 from hybridve.calib.rig_io import read_rig, write_rig
+from hybridve.calib.target import Chessboard
 from hybridve.hull.capture.recording import stored_silhouettes
 from hybridve.hull.capture.rig import rig_digest
 from hybridve.hull.capture.session import load_session
@@ -227,6 +233,34 @@ def test_leaving_out_the_motion_gives_a_wrong_answer(
     assert gap_bounds(5)[1] < -0.1
     assert fifth.contact.certificate == "free"
     assert fifth.clearance.lower_m > 0.05
+
+
+def test_a_mount_calibrated_from_noisy_boards_gives_the_same_answers(
+    scene: Path, engine: Engine, tmp_path: Path, results: list[FrameResult]
+) -> None:
+    path = write_session(tmp_path)
+    rng = np.random.default_rng(0)
+    board, lens = Chessboard(8, 5, 0.1), true_rig(0)["head"]
+    sightings, poses = [], {}
+    for instant in range(30):
+        center = board.center_board + np.array([*rng.uniform(-0.7, 0.7, 2), rng.uniform(1.0, 1.6)])
+        pose = look_at(center, board.center_board, rng.uniform(-0.6, 0.6))
+        pixels = img_from_cam(lens, transform(pose, board.points_board))
+        pixels += rng.normal(0.0, 0.1, pixels.shape)
+        sightings.append(Sighting(f"{instant}.png", instant, 0, pixels))
+        poses[instant] = tracked(pose)
+    mount, about = mount_camera(lens, [board], sightings, poses)
+    write_rig(tmp_path / "rig" / "rig.json", Rig(true_rig(0).cameras, mounts={"head": mount}))
+
+    found = list(evaluate(chain_of(path, scene), engine))
+
+    assert 0.0 < about["offset_std_mm"] < 3.0
+    for result, expected in zip(found, results, strict=True):
+        for one, true in zip(result.findings, expected.findings, strict=True):
+            assert one.contact.certificate == true.contact.certificate
+            assert one.clearance is not None
+            assert true.clearance is not None
+            assert abs(one.clearance.upper_m - true.clearance.upper_m) < 0.005
 
 
 def test_a_frame_without_a_tracked_pose_is_a_row_with_the_reason(
@@ -453,6 +487,28 @@ def test_between_two_frames_a_camera_goes_straight_and_turns_evenly(chain: Chain
 
     np.testing.assert_allclose(turned(before, middle), 0.25 * turned(before, after), atol=1e-9)
     assert np.linalg.norm(turned(before, after)) > 0.1
+
+
+@given(
+    angle_rad=st.one_of(st.floats(-8, 0).map(lambda power: 10.0**power), st.floats(1.0, 3.1)),
+    fraction=st.floats(0.01, 0.99),
+)
+def test_a_turn_of_any_angle_is_shared_out(angle_rad: float, fraction: float) -> None:
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    views = ring_views(2)
+    matrices = views.img_from_local.copy()
+    matrices[1, :, :3] = matrices[1, :, :3] @ cv2.Rodrigues(angle_rad * axis)[0]
+    turned = replace(views, img_from_local=matrices)
+
+    middle = interpolated_views(views, turned, fraction)
+
+    part = cv2.Rodrigues(fraction * angle_rad * axis)[0]
+    expected = views.img_from_local[1, :, :3] @ part
+    error = np.linalg.solve(
+        views.img_from_local[1, :, :3], middle.img_from_local[1, :, :3] - expected
+    )
+    assert np.abs(error).max() < 1e-11 + 1e-7 * (angle_rad > 1)
+    np.testing.assert_array_equal(middle.img_from_local[0], views.img_from_local[0])
 
 
 def test_views_of_other_cameras_have_nothing_between_them() -> None:

@@ -157,10 +157,26 @@ def interpolated_views(before: Views, after: Views, fraction: float) -> Views:
     centers = (1.0 - fraction) * _centers(first) + fraction * _centers(second)
     matrices = first.copy()
     for camera in np.flatnonzero((first != second).any(axis=(1, 2))):
-        vector = cv2.Rodrigues(turns[camera])[0]
-        matrix = first[camera, :, :3] @ cv2.Rodrigues(fraction * vector)[0]
+        turn = cv2.Rodrigues(fraction * _rotation_vector(turns[camera]))[0]
+        matrix = first[camera, :, :3] @ turn
         matrices[camera] = np.column_stack([matrix, -matrix @ centers[camera]])
     return replace(before, img_from_local=matrices)
+
+
+def _rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return axis times angle (3,) of a rotation; OpenCV's forgets angles below 1e-5."""
+    axis = 0.5 * np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
+    sine = float(np.linalg.norm(axis))
+    cosine = 0.5 * (float(np.trace(rotation)) - 1.0)
+    if cosine < 0.0:
+        return np.asarray(cv2.Rodrigues(rotation)[0].ravel(), np.float64)
+    return axis * (np.arctan2(sine, cosine) / sine) if sine else axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
