@@ -513,8 +513,8 @@ def _search_pictures(
             waiting.append((index, board, search.question(picture, board, effort), future))
         collect(2 * search.threads)  # so that memory does not grow with the source
 
-    total = len(choice.of(_length(search, source)))
     if source.is_video:
+        total = len(choice.of(_length(search, source)))
         content = search.identify(source.paths, source.label)
         # Only reading tells how many frames a video has.
         walk: _Key = ("frames", content, choice.step, *sorted(choice.more))
@@ -530,7 +530,9 @@ def _search_pictures(
             collect(0)
             search.cache.keep(walk, ({"indices": done}, None))
     else:
-        for number, index in enumerate(choice.of(total), start=1):
+        indices = choice.of(len(source.paths))
+        total = len(indices)
+        for number, index in enumerate(indices, start=1):
             path = source.paths[index]
             picture: _Key = ("picture", search.identify([path], source.label), 0)
             if recall(index, picture) != []:
@@ -654,14 +656,34 @@ def _sightings(
     sightings = []
     notes = []
     for index, image in names.items():
-        for number in range(len(boards)):
-            detection = found.detections.get((index, number))
-            if detection is None or detection.corners is None:
-                continue
-            instant = index if is_clip else None
-            sightings.append(Sighting(image, instant, number, detection.corners))
-            notes += _notes(boards, number, image, detection)
+        in_image = {
+            number: found.detections[index, number]
+            for number in range(len(boards))
+            if (index, number) in found.detections
+        }
+        for number, detection in _without_parts(boards, in_image).items():
+            if detection.corners is not None:
+                instant = index if is_clip else None
+                sightings.append(Sighting(image, instant, number, detection.corners))
+                notes += _notes(boards, number, image, detection)
     return tuple(sightings), tuple(notes)
+
+
+def _without_parts(boards: Sequence[Board], found: dict[int, Detection]) -> dict[int, Detection]:
+    """Return what was found in one picture without chessboards that are a part of a larger one."""
+    plain = {
+        number: detection.corners[is_seen(detection.corners)].astype(np.float32)
+        for number, detection in found.items()
+        if detection.corners is not None and isinstance(boards[number], Chessboard)
+    }
+    kept = dict(found)
+    for (i, first), (j, second) in combinations(plain.items(), 2):
+        part, whole = (i, second) if len(first) < len(second) else (j, first)
+        middle = plain[part].mean(axis=0)
+        outline = np.asarray(cv2.convexHull(whole))
+        if cv2.pointPolygonTest(outline, (float(middle[0]), float(middle[1])), False) > 0:
+            kept[part] = Detection(None, "found only as a part of a larger board")
+    return kept
 
 
 def _notes(boards: Sequence[Board], number: int, image: str, detection: Detection) -> list[str]:
@@ -672,9 +694,9 @@ def _notes(boards: Sequence[Board], number: int, image: str, detection: Detectio
 # --- The clip that all cameras recorded at once -----------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Unseen:
-    """A clip whose average shows no board.
+    """A clip whose average shows no board that can be trusted.
 
     Attributes
     ----------
@@ -684,11 +706,14 @@ class _Unseen:
         Whether anything did.
     tried : str
         How the average was searched.
+    faint : _Seen or None
+        Boards that the average shows, and most single frames do not.
     """
 
     moves: bool
     changes: bool
-    tried: str
+    tried: str = ""
+    faint: _Seen | None = None
 
 
 class _Clip:
@@ -792,6 +817,9 @@ def _observe_clips(
             if not isinstance(still, _Unseen):
                 continue
             found = _search_clip(search, clip, given) if still.changes else _Found()
+            if not found.with_board and still.faint is not None:
+                stills[index] = still.faint  # in the noise of each frame, and in no other place
+                continue
             if not found.with_board:
                 raise CalibrationError(
                     f"camera {clip.camera.name!r}: {_list_boards(search.boards)} found in "
@@ -826,7 +854,7 @@ def _observe_still_clip(search: _Search, clip: _Clip, given: _Given) -> _Seen | 
     by_hand = given.whole
     marked = _marked_still(given, search.settings.still_px)
     if marked is None:
-        return _Unseen(True, True, "")
+        return _Unseen(True, True)
     average: _Key = (*clip.key, "average")
 
     def detect(board: int, effort: Effort) -> Detection:
@@ -837,9 +865,10 @@ def _observe_still_clip(search: _Search, clip: _Clip, given: _Given) -> _Seen | 
     missing = [board for board in searched if found[board].corners is None]
     moves, changes = _moves(search, clip, missing) if missing else (False, False)
     if moves:
-        return _Unseen(True, True, "")
+        return _Unseen(True, True)
     found |= {board: detect(board, "thorough") for board in missing}
     found |= {board: Detection(pixels, "given") for board, pixels in marked.items()}
+    found = _without_parts(boards, found)
     notes = []
     hows = {}
     hand_looks = []
@@ -871,16 +900,15 @@ def _observe_still_clip(search: _Search, clip: _Clip, given: _Given) -> _Seen | 
     spreads_px = {
         number: _spread(search, clip, number, pixels) for number, pixels in corners.items()
     }
-    for number, spread_px in spreads_px.items():
-        if (
-            spread_px is not None
-            and spread_px > search.settings.still_px
-            and number not in by_hand
-            and number not in marked
-        ):
-            return _Unseen(True, True, "")
+    strays_px = [
+        spread_px
+        for number, spread_px in spreads_px.items()
+        if spread_px is not None and number not in by_hand and number not in marked
+    ]
+    if any(search.settings.still_px < stray_px < np.inf for stray_px in strays_px):
+        return _Unseen(True, True)
     known_px = [spread_px for spread_px in spreads_px.values() if spread_px is not None]
-    return _Seen(
+    seen = _Seen(
         clip.size_px,
         tuple(Sighting(CLIP, 0, number, pixels) for number, pixels in corners.items()),
         how="; ".join(f"{_name_of(boards, number)}: {how}" for number, how in hows.items())
@@ -892,6 +920,7 @@ def _observe_still_clip(search: _Search, clip: _Clip, given: _Given) -> _Seen | 
         spread_px=max(known_px) if known_px else None,
         hand_look=min(hand_looks)[2] if hand_looks else None,
     )
+    return _Unseen(False, True, faint=seen) if np.inf in strays_px else seen
 
 
 def _still_in_frames(search: _Search, clip: _Clip, found: _Found) -> _Seen | None:
