@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.board import Board, Observations, Sighting, is_seen
 from hybridve.calib.camera import Camera
-from hybridve.calib.consensus import CommonPose, common_pose, pose_distances
+from hybridve.calib.consensus import common_pose, pose_distances
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.lens import cam_from_img
 from hybridve.calib.lens_fit import locate_board
@@ -330,60 +330,90 @@ def _start(
     spacing: int,
     max_offset: int,
 ) -> dict[int, _Start]:
-    """Return offsets and poses of the cameras that can be reached from the first one."""
-    edges: list[tuple[int, float, int, int, int, Pose]] = []
-    for one, other in combinations(range(len(poses)), 2):
-        best: tuple[float, int, int, CommonPose] | None = None
-        for late in range(-(max_offset // spacing), max_offset // spacing + 1):
-            ahead = late * spacing
-            keys = sorted(key for key in poses[one] if (key[0], key[1] - ahead) in poses[other])
-            if len(keys) < _MIN_COMMON:
-                continue
-            common = _relative_pose(boards, poses[one], poses[other], keys, ahead)
-            if best is None or (common.error, abs(ahead)) < (best[0], abs(best[1])):
-                best = (common.error, ahead, len(keys), common)
-        if best is not None and best[0] <= _DISAGREE:
-            edges.append((best[2], -best[0], one, other, best[1], best[3].pose))
-    found = {0: _Start(0, np.eye(3, 4))}
+    """Return offsets and poses of the cameras that can be reached from the first one.
+
+    Pairs that share most frames go first; pairs of cameras that hang together already are spared.
+    """
+    views = [_Views.of(boards, seen) for seen in poses]
+    pairs = sorted(
+        combinations(range(len(poses)), 2),
+        key=lambda pair: (-len(poses[pair[0]].keys() & poses[pair[1]].keys()), pair),
+    )
+    part = list(range(len(poses)))
+    edges: list[tuple[int, int, int, Pose]] = []
+    for one, other in pairs:
+        if part[one] == part[other]:
+            continue
+        found = _whole_offset(views[one], views[other], spacing, max_offset)
+        if found is not None:
+            edges += [
+                (one, other, found[0], found[1]),
+                (other, one, -found[0], invert(found[1])),
+            ]
+            part = [part[one] if label == part[other] else label for label in part]
+    start = {0: _Start(0, np.eye(3, 4))}
     while True:
-        reach = [edge for edge in edges if (edge[2] in found) != (edge[3] in found)]
-        if not reach:
-            return found
-        _, _, one, other, ahead, other_from_one = max(reach, key=lambda edge: edge[:2])
-        if one in found:
-            known = found[one]
-            pose = compose(other_from_one, known.cam_from_rig)
-            found[other] = _Start(known.offset + ahead, pose)
-        else:
-            known = found[other]
-            pose = compose(invert(other_from_one), known.cam_from_rig)
-            found[one] = _Start(known.offset - ahead, pose)
+        edge = next((edge for edge in edges if edge[0] in start and edge[1] not in start), None)
+        if edge is None:
+            return start
+        known, new, ahead, new_from_known = edge
+        pose = compose(new_from_known, start[known].cam_from_rig)
+        start[new] = _Start(start[known].offset + ahead, pose)
 
 
-def _relative_pose(
-    boards: Sequence[Board],
-    first: Mapping[tuple[int, int], Pose],
-    second: Mapping[tuple[int, int], Pose],
-    keys: Sequence[tuple[int, int]],
-    ahead: int,
-) -> CommonPose:
-    """Return the relative pose that the first's views share with the second's `ahead` earlier."""
-    chosen = np.linspace(0, len(keys) - 1, min(len(keys), _JUDGED)).round().astype(int)
-    measured = []
-    lengths = []
-    for board, instant in (keys[index] for index in chosen):
-        from_first = invert(first[board, instant])
-        pose = second[board, instant - ahead]
-        lengths.append(float(np.linalg.norm(pose[:, 3])))
-        measured.append(
-            np.stack(
-                [
-                    compose(compose(pose, boards[board].board_from_turned(look)), from_first)
-                    for look in range(len(boards[board].looks))
-                ]
-            )
-        )
-    return common_pose(measured, np.ones(len(measured)), float(np.median(lengths)))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Views:
+    """A camera's located boards: by board and instant the row of each, and their poses.
+
+    `cam_from_board` (V, L, 3, 4) holds one pose for each look, repeated for boards with fewer.
+    """
+
+    row_of: dict[tuple[int, int], int]
+    cam_from_board: NDArray[np.float64]
+    board_from_cam: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, boards: Sequence[Board], poses: Mapping[tuple[int, int], Pose]) -> "_Views":
+        turns = [
+            [board.board_from_turned(look) for look in range(len(board.looks))] for board in boards
+        ]
+        n_looks = max(map(len, turns))
+        keys = sorted(poses)
+        turned = np.zeros((len(keys), n_looks, 3, 4))
+        inverses = np.zeros((len(keys), 3, 4))
+        for row, key in enumerate(keys):
+            inverses[row] = invert(poses[key])
+            for look in range(n_looks):
+                turn = turns[key[0]][look % len(turns[key[0]])]
+                turned[row, look] = compose(poses[key], turn)
+        return cls({key: row for row, key in enumerate(keys)}, turned, inverses)
+
+
+def _whole_offset(
+    first: _Views, second: _Views, spacing: int, max_offset: int
+) -> tuple[int, Pose] | None:
+    """Return by how many frames the second is later, and second_from_first.
+
+    None where no offset lets most of the common views share a relative pose.
+    """
+    best: tuple[float, int, int, Pose] | None = None
+    for late in range(-(max_offset // spacing), max_offset // spacing + 1):
+        ahead = late * spacing
+        keys = sorted(key for key in first.row_of if (key[0], key[1] - ahead) in second.row_of)
+        if len(keys) < _MIN_COMMON:
+            continue
+        chosen = np.linspace(0, len(keys) - 1, min(len(keys), _JUDGED)).round().astype(int)
+        mine = [first.row_of[keys[index]] for index in chosen]
+        other = [second.row_of[keys[index][0], keys[index][1] - ahead] for index in chosen]
+        turned, inverse = second.cam_from_board[other], first.board_from_cam[mine]
+        relative = turned[..., :3] @ inverse[:, None]
+        relative[..., 3] += turned[..., 3]
+        length_m = float(np.median(np.linalg.norm(turned[:, 0, :, 3], axis=1)))
+        common = common_pose(list(relative), np.ones(len(relative)), length_m)
+        if common.error <= _DISAGREE:
+            found = (common.error, abs(ahead), ahead, common.pose)
+            best = found if best is None else min(best, found, key=lambda item: item[:3])
+    return None if best is None else best[2:]
 
 
 # --- Fractions of frames ---------------------------------------------------------------------

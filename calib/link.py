@@ -30,7 +30,7 @@ from hybridve.calib.consensus import CommonPose, common_pose, pose_distances
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.lens_fit import locate_board, rms
+from hybridve.calib.lens_fit import locate_board, rms, view_label
 from hybridve.calib.pose import Pose, compose, invert, transform
 
 #: Common views that differ by more than this (radians plus shares of the board's distance, median)
@@ -100,6 +100,11 @@ class SolvedLens(Protocol):
     @property
     def pixels(self) -> Mapping[tuple[str, int], NDArray[np.float64]]:
         """Their points: (N, 2) pixels, NaN where not seen or an outlier."""
+        ...
+
+    @property
+    def dropped(self) -> Mapping[str, str]:
+        """Views that do not fit, by `view_label`, and why."""
         ...
 
 
@@ -190,12 +195,12 @@ def link_cameras(
     boards : sequence of NamedBoard
         The boards; `Sighting.board` counts them.
     lenses : sequence of SolvedLens
-        The lenses of the cameras, and where the boards lay in the views they were fitted to. Stills
-        and frames of moving clips that are not among them were dropped and are not used.
+        The lenses of the cameras, and where the boards lay in the views they were fitted to. Other
+        stills are not used, nor are views that the lens dropped; the clip's others are located.
     observations : sequence of Observations
         What the same cameras saw.
     is_labelled : bool
-        Whether boards that look the same when turned are listed consistently already.
+        Whether boards that look the same when turned are listed consistently in the clip already.
 
     Raises
     ------
@@ -266,10 +271,7 @@ class _Chain:
         looks: dict[tuple[_Moment, int, int], _Look] = {}
         for rank, index in enumerate(camera_order):
             for sighting in observations[index].sightings:
-                is_apart = observations[index].is_still and sighting.instant is not None
-                look = _located(
-                    boards, lenses[index], rank, board_rank, sighting, is_apart, is_labelled
-                )
+                look = _located(boards, lenses[index], rank, board_rank, sighting, is_labelled)
                 if look is not None:
                     key = (look.moment, look.camera, look.board)
                     if key not in looks or sighting.image < looks[key].image:
@@ -482,22 +484,20 @@ def _located(
     camera: int,
     board_rank: Mapping[int, int],
     sighting: Sighting,
-    is_apart: bool,
     is_labelled: bool,
 ) -> _Look | None:
-    """Return a view with its poses; None if it was dropped, or has none.
-
-    A view of a still clip is apart from those that the lens was fitted to.
-    """
+    """Return a view with its poses; None if it was dropped, or has none."""
     board = boards[sighting.board]
     key = (sighting.image, sighting.board)
     pose, pixels = lens.views.get(key), lens.pixels.get(key, sighting.pixels)
-    if pose is None and is_apart:
+    is_dropped = view_label(boards, sighting.image, sighting.board) in lens.dropped
+    if pose is None and sighting.instant is not None and not is_dropped:
         located = locate_board(lens.camera, board.points_board, pixels)
         pose = None if located is None else located[0]
     if pose is None:
         return None
-    n_looks = 1 if is_labelled else len(board.looks)
+    # Stills are listed as they were found: only what was seen at once can be listed consistently.
+    n_looks = 1 if is_labelled and sighting.instant is not None else len(board.looks)
     turned = [compose(pose, board.board_from_turned(look)) for look in range(n_looks)]
     moment = (-1, camera, sighting.image) if sighting.instant is None else (sighting.instant, 0, "")
     points_cam = transform(pose, board.points_board[is_seen(pixels)])
@@ -779,10 +779,11 @@ def _refuse_exchanged(
     )
     suspects: list[tuple[Camera, Observations, str, float]] = []
     for lens, seen in ordered:
-        of_clip = _typical_error(boards, lens.camera, seen, "clip")
-        of_stills = _typical_error(boards, lens.camera, seen, "stills")
+        of_clip = _typical_error(boards, lens.camera, seen, "clip", lens.views)
+        of_stills = _typical_error(boards, lens.camera, seen, "stills", lens.views)
         what, missed_px = ("clip", of_clip) if of_clip > of_stills else ("stills", of_stills)
-        if missed_px > max(_CLIP_LIMIT_PX, _CLIP_FACTOR * min(of_clip, of_stills)):
+        usual_px = min(of_clip, of_stills) or _CLIP_HOPELESS_PX  # 0: nothing to compare with
+        if missed_px > max(_CLIP_LIMIT_PX, _CLIP_FACTOR * usual_px):
             suspects.append((lens.camera, seen, what, missed_px))
     for (own, seen, what, px), (others, other, other_what, other_px) in combinations(suspects, 2):
         exchanged_px = _typical_error(boards, others, seen, what)
@@ -808,11 +809,16 @@ def _refuse_exchanged(
 
 
 def _typical_error(
-    boards: Sequence[NamedBoard], camera: Camera, seen: Observations, what: str
+    boards: Sequence[NamedBoard],
+    camera: Camera,
+    seen: Observations,
+    what: str,
+    views: Mapping[tuple[str, int], Pose] | None = None,
 ) -> float:
     """Return how far a lens misses the boards of the clip or the stills, median of rms, pixels.
 
-    0 where there are none, infinite where the lens is that of another image size.
+    0 where there are none, infinite where the lens is that of another image size. Views that were
+    located need not be so again.
     """
     if (camera.width_px, camera.height_px) != tuple(seen.size_px):
         return np.inf
@@ -822,11 +828,16 @@ def _typical_error(
     )
     count = min(len(sightings), _TYPICAL_VIEWS)
     chosen = np.linspace(0, len(sightings) - 1, count).round().astype(int)
-    located = [
-        locate_board(camera, boards[s.board].points_board, s.pixels)
-        for s in (sightings[index] for index in chosen)
-    ]
-    errors = [found[1] for found in located if found is not None]
+    errors = []
+    for sighting in (sightings[index] for index in chosen):
+        board = boards[sighting.board]
+        pose = (views or {}).get((sighting.image, sighting.board))
+        if pose is not None:
+            errors.append(rms(_residuals(camera, pose, board, sighting.pixels)))
+            continue
+        located = locate_board(camera, board.points_board, sighting.pixels)
+        if located is not None:
+            errors.append(located[1])
     return float(np.median(errors)) if errors else 0.0
 
 

@@ -85,26 +85,26 @@ def test_offsets_are_found_to_a_fraction_of_a_frame() -> None:
     assert not clocks.notes
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(late=st.floats(-12.0, 12.0), other=st.floats(-12.0, 12.0))
 def test_any_offset_is_found(late: float, other: float) -> None:
     true = {"cam1": 0.0, "cam2": late, "cam3": other}
 
-    assert estimate(out_of_time(true)).offset_frames == pytest.approx(true, abs=EXACT_FRAMES)
+    assert estimate(out_of_time(true, 50)).offset_frames == pytest.approx(true, abs=EXACT_FRAMES)
 
 
 def test_the_stated_error_is_the_error() -> None:
     shares = []
-    for seed in range(10):
-        clocks = estimate(out_of_time(LATE, noise_px=0.2, seed=seed))
+    for seed in range(8):
+        clocks = estimate(out_of_time(LATE, 50, noise_px=0.2, seed=seed))
         for name in ("cam2", "cam3"):
             assert 0.0 < clocks.std_frames[name] < 0.05
             error = clocks.offset_frames[name] - LATE[name]
             shares.append(error / clocks.std_frames[name])
 
     assert np.abs(shares).max() < 4.0
-    # Chi-squared with 20 degrees of freedom, root of the mean: 0.54 to 1.51 in 99.8 of 100 cases.
-    assert 0.5 < np.sqrt(np.mean(np.square(shares))) < 1.51
+    # Chi-squared with 16 degrees of freedom, root of the mean: 0.49 to 1.57 in 99.8 of 100 cases.
+    assert 0.49 < np.sqrt(np.mean(np.square(shares))) < 1.57
 
 
 def test_a_symmetric_board_tells_them_too() -> None:
@@ -114,7 +114,7 @@ def test_a_symmetric_board_tells_them_too() -> None:
 
 
 def test_the_order_of_cameras_changes_no_bit() -> None:
-    recording = out_of_time(LATE, noise_px=0.2)
+    recording = out_of_time(LATE, 40, noise_px=0.2)
     turned = estimate_offsets(
         recording.boards, recording.lenses[::-1], recording.observations[::-1]
     )

@@ -108,6 +108,32 @@ def test_noise_moves_the_chain_by_little() -> None:
     assert_linked(link(recording), recording, tolerance=0.05)
 
 
+def test_views_that_the_lens_dropped_are_not_used_and_others_are_located() -> None:
+    recording = passing_by(3, per_camera=8)
+    lens = recording.lenses[1]
+    dropped, unknown = sorted(lens.views)[3:5]
+    lens.views.pop(dropped)
+    lens.views.pop(unknown)
+    lens.dropped[dropped[0]] = "blurred"
+
+    linked = link(recording)
+
+    assert_linked(linked, recording)
+    images = {view.image for view in linked.views if view.camera == 1}
+    assert dropped[0] not in images
+    assert unknown[0] in images
+
+
+def test_two_cameras_are_linked_by_one_view() -> None:
+    pose = held_up(np.random.default_rng(3), BOARD, (0.1, 0.0, 0.0))
+    recording = record([BOARD], row_of_cameras(2, 0.2), {17: {0: pose}})
+
+    linked = link(recording)
+
+    assert_linked(linked, recording)
+    assert linked.pose_names == ((17, "board"),)
+
+
 def test_one_camera_alone_is_a_rig() -> None:
     recording = passing_by(1, stills=3)
 

@@ -1,7 +1,7 @@
 """What fixed cameras saw of one or several boards, still or moving, with the truth."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ class ExactLens:
     camera: Camera
     views: dict[tuple[str, int], Pose]
     pixels: dict[tuple[str, int], NDArray[np.float64]]
+    dropped: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
