@@ -113,6 +113,9 @@ _COST_TOLERANCE = 1e-15
 _MAX_STEPS = 200
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING = 1e-13
+
+#: Of the largest eigenvalue: what is below is rounding.
+_ROUNDING = 3e-15
 _MOST_DAMPING = 1e12
 
 
@@ -532,7 +535,7 @@ def _normal_equations(
         rows = weighted
     jacobian = np.zeros((*mask.shape, 2, rows.shape[2]))
     jacobian[mask] = rows
-    jacobian = jacobian.reshape(n_views, -1, rows.shape[2])
+    jacobian = jacobian.reshape(n_views, 2 * mask.shape[1], rows.shape[2])
     gram = jacobian.transpose(0, 2, 1) @ jacobian  # (V, 7 + P, 7 + P)
     of_poses, of_lens = slice(0, 6), slice(6, 6 + n_params)
     normal = _Normal(
@@ -570,7 +573,7 @@ def _step(normal: _Normal, damping: float) -> tuple[NDArray[np.float64], NDArray
 
 
 def _inverse(
-    information: NDArray[np.float64], diagonal: NDArray[np.float64], least: float = _LEAST_DAMPING
+    information: NDArray[np.float64], diagonal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the inverse of an information matrix where it is known; zero where it is not.
 
@@ -579,7 +582,7 @@ def _inverse(
     scale = np.sqrt(diagonal)
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    known = values > least * max(values[-1], 1e-300)
+    known = values > _ROUNDING * max(values[-1], 1e-300)
     vectors = vectors[:, known] / scale[:, None]
     return np.asarray((vectors / values[known]) @ vectors.T)
 
@@ -976,7 +979,8 @@ def fit_batch(
             else "the lens sees no ray at some corner"
             for index in np.flatnonzero(~good)
         }
-        if (good == kept).all() and (new_mask[good] == mask[good]).all():
+        is_same = np.array_equal(np.flatnonzero(good), used)
+        if is_same and (new_mask[used] == mask[used]).all():
             break
         kept, mask = good, new_mask
     kept = np.zeros(n_views, np.bool_)
@@ -1117,15 +1121,20 @@ def refuse_degenerate(seen: Sequence[Observations], batch: Batch, fit: Fit) -> N
     n_ambiguous = _count_ambiguous(fit, part, used)
     camera = fit.lens.camera
     longest_px = max(seen[0].size_px)
-    if 2 * n_ambiguous > len(used):
+    is_hidden = 2 * n_ambiguous > len(used)
+    if is_hidden and size_px < _SMALL * longest_px:
         raise CalibrationError(
             f"{who(seen)}: the board is too small in the image to tell its tilt in {n_ambiguous} "
             f"of {len(used)} views (it spans {size_px:.0f} of {longest_px} px in the "
             "median), expected in less than half; record it closer, or with a larger board"
         )
+    found = f"within {spread_deg:.1f} degrees"
+    if is_hidden and share > _FOCAL_REFUSED:
+        found = f"no tilt shows in {n_ambiguous} of {len(used)} views"
+        spread_deg = 0.0
     if spread_deg < (_PARALLEL_DEG if share <= _FOCAL_REFUSED else _TILTED_DEG):
         raise CalibrationError(
-            f"{who(seen)}: all {len(used)} boards are parallel (within {spread_deg:.1f} degrees), "
+            f"{who(seen)}: all {len(used)} boards are parallel ({found}), "
             "so that focal length and distance cannot be told apart; record the board tilted by 20 "
             "to 40 degrees to different sides, or give the lens (`params`)"
         )
