@@ -860,32 +860,45 @@ def _observe_still_clip(search: _Search, clip: _Clip, given: _Given) -> _Seen | 
     def detect(board: int, effort: Effort) -> Detection:
         return search.detect(average, board, effort, lambda: clip.picture)
 
-    searched = [board for board in range(len(boards)) if board not in marked]
-    found = {board: detect(board, "quick") for board in searched}
-    missing = [board for board in searched if found[board].corners is None]
+    found = {board: detect(board, "quick") for board in range(len(boards))}
+    missing = [board for board, detection in found.items() if detection.corners is None]
     moves, changes = _moves(search, clip, missing) if missing else (False, False)
     if moves:
         return _Unseen(True, True)
-    found |= {board: detect(board, "thorough") for board in missing}
-    found |= {board: Detection(pixels, "given") for board, pixels in marked.items()}
+    found |= {board: detect(board, "thorough") for board in missing if board not in marked}
     found = _without_parts(boards, found)
+    spreads_px = {
+        board: _spread(search, clip, board, detection.corners)
+        for board, detection in found.items()
+        if detection.corners is not None
+    }
+    strays_px = [
+        spread_px
+        for board, spread_px in spreads_px.items()
+        if spread_px is not None and board not in by_hand
+    ]
+    if any(search.settings.still_px < stray_px < np.inf for stray_px in strays_px):
+        return _Unseen(True, True)
+    found |= {board: Detection(pixels, "given") for board, pixels in marked.items()}
     notes = []
     hows = {}
     hand_looks = []
     for number, detection in sorted(found.items()):
         hows[number] = f"detected ({detection.how})"
-        if detection.corners is None and number in by_hand:
+        if number in marked:
+            hows[number] = "given"
+            hand_looks.append((len(boards[number].looks) < 2, number, 0))
+        elif detection.corners is None and number in by_hand:
             detection = _place_by_hand(boards[number], clip, by_hand[number], detection.how)
             found[number] = detection
             hows[number] = detection.how
-        elif number in marked:
-            hows[number] = "given"
-            hand_looks.append((len(boards[number].looks) < 2, number, 0))
+            if detection.corners is not None:
+                spreads_px[number] = _spread(search, clip, number, detection.corners)
         if detection.corners is None:
-            hows[number] = "not found" if len(boards) > 1 else detection.how
+            hows[number] = "not found"
             continue
         notes += _notes(boards, number, CLIP, detection)
-        if number in by_hand:
+        if number in by_hand and number not in marked:
             look = _look_by_hand(boards[number], clip, detection.corners, by_hand[number])
             if look is not None:
                 hand_looks.append((len(boards[number].looks) < 2, number, look))
@@ -897,16 +910,6 @@ def _observe_still_clip(search: _Search, clip: _Clip, given: _Given) -> _Seen | 
     if not corners:
         tried = "; ".join(dict.fromkeys(detection.how for detection in found.values()))
         return _Unseen(False, changes, tried)
-    spreads_px = {
-        number: _spread(search, clip, number, pixels) for number, pixels in corners.items()
-    }
-    strays_px = [
-        spread_px
-        for number, spread_px in spreads_px.items()
-        if spread_px is not None and number not in by_hand and number not in marked
-    ]
-    if any(search.settings.still_px < stray_px < np.inf for stray_px in strays_px):
-        return _Unseen(True, True)
     known_px = [spread_px for spread_px in spreads_px.values() if spread_px is not None]
     seen = _Seen(
         clip.size_px,
