@@ -650,18 +650,17 @@ def _read_out(chain: _Chain, boards: Sequence[NamedBoard], cameras: Sequence[Cam
     rig_from_body: dict[tuple[_Moment, tuple[bool, str]], Pose] = {}
     chosen: list[tuple[tuple[_Moment, tuple[bool, str]], _Look, int, float, float]] = []
     for key, looks in sorted(together.items()):
-        pose = _middle_pose([chain.in_part(look) for look in looks], looks, chain.length_m)
-        rig_from_body[key] = pose
-        for look in looks:
-            turns = pose_distances(pose[None], chain.in_part(look), chain.length_m)[0]
-            turn = int(np.argmin(turns))
-            board, camera = chain.boards[look.board], chain.cameras[look.camera]
-            pixels = look.pixels[board.looks[turn]]
-            cam_from_board = compose(
-                cam_from_rig[look.camera], compose(pose, body_from_board[look.board])
-            )
-            missed_px = rms(_residuals(camera, cam_from_board, board, pixels))
-            chosen.append((key, look, turn, missed_px, _size_px(pixels)))
+        proposed = [chain.in_part(look) for look in looks]
+        rig_from_body[key] = _middle_pose(proposed, looks, chain.length_m)
+        fits = _fits(chain, looks, proposed, rig_from_body[key])
+        if any(missed_px > _LEFT_OUT_SHARE * size_px for _, missed_px, size_px in fits):
+            # A board whose tilt was taken for the other one that a plane allows fits its own image
+            # only: the right pose fits all.
+            trials = [
+                (pose, _fits(chain, looks, proposed, pose)) for pose in np.concatenate(proposed)
+            ]
+            rig_from_body[key], fits = min(trials, key=lambda trial: _total_share(trial[1]))
+        chosen += [(key, look, *fit) for look, fit in zip(looks, fits, strict=True)]
     left_out = _disagreeing(chain, chosen)
 
     used = sorted({key for key, look, *_ in chosen if id(look) not in left_out})
@@ -701,6 +700,35 @@ def _middle_pose(
         apart = pose_distances(everything, poses, length_m).min(axis=1)
         misses += look.weight * np.minimum(apart, _DISAGREE)
     return np.asarray(everything[int(np.argmin(misses))])
+
+
+def _fits(
+    chain: _Chain,
+    looks: Sequence[_Look],
+    proposed: Sequence[NDArray[np.float64]],
+    rig_from_body: Pose,
+) -> list[tuple[int, float, float]]:
+    """Return for each view the look that suits a pose, by how far it misses, and the board's size.
+
+    The cameras and boards of `chain` are those of the whole, not of parts; pixels.
+    """
+    found = []
+    for look, poses in zip(looks, proposed, strict=True):
+        turn = int(np.argmin(pose_distances(rig_from_body[None], poses, chain.length_m)[0]))
+        board = chain.boards[look.board]
+        pixels = look.pixels[board.looks[turn]]
+        cam_from_board = compose(
+            chain.cam_from_part[look.camera],
+            compose(rig_from_body, chain.part_from_board[look.board]),
+        )
+        missed_px = rms(_residuals(chain.cameras[look.camera], cam_from_board, board, pixels))
+        found.append((turn, missed_px, _size_px(pixels)))
+    return found
+
+
+def _total_share(fits: Sequence[tuple[int, float, float]]) -> float:
+    """Return how badly a pose suits views: wrong ones count no more than just wrong."""
+    return sum(min(missed_px / size_px, _LEFT_OUT_SHARE) for _, missed_px, size_px in fits)
 
 
 def _size_px(pixels: NDArray[np.float64]) -> float:

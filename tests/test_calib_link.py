@@ -424,6 +424,28 @@ def test_a_view_that_disagrees_is_left_out_and_named() -> None:
     assert "px" in linked.left_out[name]
 
 
+def test_a_tilt_taken_for_the_other_is_put_right_by_the_other_camera() -> None:
+    recording = passing_by(2, per_camera=8)
+    lens = recording.lenses[0]
+    shared = {s.image for s in recording.observations[1].sightings}
+    image = next(image for image, _ in sorted(lens.views) if image in shared)
+    pose = lens.views[image, 0]
+    # Mirror the board's normal at the ray through its middle: nearly the same image.
+    middle = transform(pose, BOARD.center_board[None])[0]
+    axis = middle / np.linalg.norm(middle)
+    normal = 2.0 * (axis @ pose[:, 2]) * axis - pose[:, 2]
+    x = pose[:, 0] - (pose[:, 0] @ normal) * normal
+    x /= np.linalg.norm(x)
+    rotation = np.column_stack([x, np.cross(normal, x), normal])
+    lens.views[image, 0] = np.column_stack([rotation, middle - rotation @ BOARD.center_board])
+    assert angle_between(lens.views[image, 0], pose) > 0.2
+
+    linked = link(recording)
+
+    assert_linked(linked, recording)
+    assert not linked.left_out
+
+
 def test_the_same_pictures_under_two_names_are_refused() -> None:
     recording = passing_by(2)
     twin = replace(recording.observations[0], name="cam7")
