@@ -1,11 +1,12 @@
 """Points of boards that were found by something else, read from files.
 
 A CSV with a header may say of each point in which image it lies: ``image`` (a file's name, with
-as much of its folders as makes it unique) or ``frame`` (of the extrinsic clip, from 0); to which
-``board`` it belongs, by name; and which ``corner`` of that board it is, from 0, in the order of
-`Board.points_board`. Corners that are not named were not seen. Without ``corner``, all of a
-board's points are expected in their order. Files of OpenCV, and CSV files that name no image, hold
-the points of one board in the extrinsic clip, see `read_corners`.
+as much of its folders as makes it unique; "frame 3" of stills that are a video) or ``frame`` (of
+the extrinsic clip, from 0); to which ``board`` it belongs, by name; and which ``corner`` of that
+board it is, from 0, in the order of `Board.points_board`. Corners that are not named were not
+seen. Without ``corner``, all of a board's points are expected in their order. Files of OpenCV, and
+CSV files that name no image, hold the points of one board in the extrinsic clip, see
+`read_corners`.
 
 All of them are understood as OpenCV counts: the centre of the top-left pixel is at (0, 0).
 """

@@ -372,7 +372,9 @@ def _given(boards: Sequence[Board], camera: CameraInput) -> _Given:
                 )
             places = [(given.clip, corners.image)]
         else:
-            places = [(given.clip, index) for index in _named(clip, corners.image)]
+            places = []
+            if not clip.is_video:  # whose frames have a column of their own
+                places += [(given.clip, index) for index in _named(clip, corners.image)]
             if stills is not None:
                 places += [(given.stills, index) for index in _named(stills, corners.image)]
             _check_one(camera, corners, len(places))
@@ -391,9 +393,10 @@ def _check_one(camera: CameraInput, corners: GivenCorners, count: int) -> None:
 
 
 def _named(source: FrameSource, name: str) -> list[int]:
-    """Return which images of a source a name may mean."""
+    """Return which images of a source a name may mean; those of a video are called "frame 3"."""
     if source.is_video:
-        return []
+        number = name.removeprefix("frame ")
+        return [int(number)] if number != name and number.isdecimal() else []
     parts = Path(name).parts
     return [index for index, path in enumerate(source.paths) if path.parts[-len(parts) :] == parts]
 

@@ -641,6 +641,19 @@ def test_given_frames_of_a_moving_clip_are_taken_beside_those_that_are_found(
     np.testing.assert_allclose(seen.sightings[1].pixels, given, atol=1e-9)
 
 
+def test_corners_are_given_for_frames_of_videos(filmed: Path, tmp_path: Path) -> None:
+    given = truth_of(0)
+    lines = rows(given, "frame 1", "") + rows(given, "", 4)
+    path = write_csv(tmp_path / "given.csv", "image,frame,corner,x,y", lines)
+
+    (seen,) = observe_boards([BOARD], [replace(film_inputs(filmed)[0], corners=path)], SETTINGS)
+
+    found = pixels_of(seen.sightings)
+    assert {image for image, _ in found} == {*(f"frame {n}" for n in range(4)), "board clip"}
+    for image in ("frame 1", "board clip"):
+        np.testing.assert_allclose(found[image, 0], given, atol=1e-9)
+
+
 def test_given_corners_name_their_board(two_boards: Path, tmp_path: Path) -> None:
     given = np.arange(40.0).reshape(20, 2)
     path = write_csv(
