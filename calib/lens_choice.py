@@ -77,6 +77,7 @@ _OF_TANGENT = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 
 #: Steps in which a candidate shows what it can do; the one that is chosen is adjusted to the end.
 _TRIAL_STEPS = 25
+_TRIAL_TOLERANCE = 1e-6
 
 #: More of the image than this in which the lens sees nothing is told.
 _UNSEEN_TOLD = 0.02
@@ -248,7 +249,9 @@ def _fit_candidates(fit: Fit, batch: Batch, settings: LensSettings) -> list[_Can
         poses = fit.lens.poses[used]
         if not are_finite(batch_residuals(start, poses, part))[are_finite(part.pixels)].all():
             continue  # it cannot see what others do
-        lens = adjust_lens(start, poses, part, settings.loss_px, free, max_steps=_TRIAL_STEPS)
+        lens = adjust_lens(
+            start, poses, part, settings.loss_px, free, True, _TRIAL_STEPS, _TRIAL_TOLERANCE
+        )
         residuals = batch_residuals(lens.camera, lens.poses, part)
         squares = (residuals[are_finite(residuals)] ** 2).sum(axis=1)
         candidates.append(

@@ -114,6 +114,9 @@ _MAX_STEPS = 200
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING = 1e-13
 
+#: What the cost may still fall by where only a start is wanted.
+_ROUGH = 1e-3
+
 #: Of the largest eigenvalue: what is below is rounding.
 _ROUNDING = 3e-15
 _MOST_DAMPING = 1e12
@@ -412,6 +415,7 @@ def adjust_lens(
     free: NDArray[np.bool_],
     move_poses: bool = True,
     max_steps: int = _MAX_STEPS,
+    tolerance: float = _COST_TOLERANCE,
 ) -> LensAdjustment:
     """Adjust a lens and the poses of its views to the robust least squares (soft L1).
 
@@ -431,6 +435,8 @@ def adjust_lens(
         Whether the poses do.
     max_steps : int
         After so many steps the result stands as it is.
+    tolerance : float
+        A step that lowers the cost by less than this share is the last.
     """
     mask = are_finite(batch_residuals(camera, poses, batch))
     batch = batch.only(mask)
@@ -453,7 +459,7 @@ def adjust_lens(
             camera, poses, cost = moved, moved_poses, moved_cost
             damping = max(damping / 10.0, _LEAST_DAMPING)
             normal = _normal_equations(camera, poses, batch, mask, loss_px, free, move_poses)
-            if is_small or gain <= _COST_TOLERANCE * cost:
+            if is_small or gain <= tolerance * cost:
                 break
         elif is_small or damping > _MOST_DAMPING:
             break
@@ -732,7 +738,7 @@ def seed_lens(name: str, model: str, size_px: tuple[int, int], batch: Batch) -> 
         free = np.ones(len(start.params), np.bool_)
         free[_principal_indices(model)] = False
         free[_shape_indices(model)[2:]] = False
-        fitted = adjust_lens(start, poses[use], some.of(use), 1.0, free)
+        fitted = adjust_lens(start, poses[use], some.of(use), 1.0, free, tolerance=_ROUGH)
         residuals = batch_residuals(fitted.camera, fitted.poses, some.of(use))
         error = float(np.median([rms(each) for each in residuals]))
         if error < best_px:
@@ -829,11 +835,19 @@ def fit_shared_lens(
     sightings matters.
     """
     views, unusable = collect_views(boards, seen, settings, is_free=fixed_params is None)
+    if fixed_params is not None and not views:
+        return [_given_lens(camera, fixed_params) for camera in seen]
     batch = make_batch(boards, views)
     fit = fit_batch(seen, batch, settings, fixed_params)
     if fixed_params is None:
         refuse_degenerate(seen, batch, fit)
     return share_out(boards, seen, views, unusable, batch, fit, fixed_params is None)
+
+
+def _given_lens(seen: Observations, params: NDArray[np.float64]) -> FittedLens:
+    """Return a lens that is known, and that no view was fitted to."""
+    camera = Camera(seen.name, seen.model, *seen.size_px, params, np.eye(3, 4))
+    return FittedLens(camera, {}, {}, {}, (), (), 0.0, 0.0, np.zeros(len(camera.params)))
 
 
 def collect_views(
@@ -949,9 +963,8 @@ def fit_batch(
                 "sharper pictures, or choose another model"
             )
         part = batch.only(mask).of(used)
-        adjusted = adjust_lens(
-            lens, poses[used], part, settings.loss_px, rough if is_rough else every
-        )
+        free, tolerance = (rough, _ROUGH) if is_rough else (every, _COST_TOLERANCE)
+        adjusted = adjust_lens(lens, poses[used], part, settings.loss_px, free, tolerance=tolerance)
         lens = adjusted.camera
         poses[used] = adjusted.poses
         if is_rough:
