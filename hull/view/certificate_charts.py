@@ -52,8 +52,14 @@ _MEAN_CELLS, _FEWEST = 16, 3
 #: Chi-squared with two degrees of freedom exceeds this once in 1000.
 _ONE_IN_1000 = 13.8
 
+#: Residuals smaller than this are those of rounding.
+_NOTHING_PX = 1e-9
+
 #: Residuals further out than this many standard deviations are counted, not drawn.
 _HISTOGRAM_END = 5.0
+
+#: A line of equal error has a label if it is longer than this share of the picture.
+_LABELLED = 0.12
 
 #: Heights of the slices, as shares of the volume's.
 _SLICES = (("low", 1 / 6), ("middle", 1 / 2), ("high", 5 / 6))
@@ -157,7 +163,7 @@ def _draw_coverage(axes: Axes, camera: Camera, pixels: NDArray[np.float64]) -> N
     )
     full = int((counts > 0).sum())
     axes.set_title(
-        f"{len(pixels)} points in {full} of {counts.size} cells; hatched: none", fontsize=9
+        f"{len(pixels)} points in {full} of {counts.size} cells, the others hatched", fontsize=9
     )
     if not len(pixels):
         _say(axes, "saw no point of a board")
@@ -220,9 +226,22 @@ def _draw_iso_lines(
     lines = axes.contour(
         x, y, np.ma.masked_invalid(values), levels=levels, colors=colour, linewidths=0.9
     )
-    for label in axes.clabel(lines, fmt=_short, fontsize=7, inline=False):
-        label.set_path_effects(_halo())
-        label.set_clip_on(True)
+    # One label a level, on its longest piece: where the map is ragged there are many short ones.
+    shortest = _LABELLED * max(float(np.ptp(x)), float(np.ptp(y)))
+    places = []
+    for pieces in lines.allsegs:
+        lengths = [float(np.linalg.norm(np.diff(piece, axis=0), axis=1).sum()) for piece in pieces]
+        if lengths and max(lengths) > shortest:
+            piece = np.asarray(pieces[int(np.argmax(lengths))])
+            # Of closed lines, below their middle; of others, halfway.
+            closed = np.allclose(piece[0], piece[-1])
+            at = int(piece[:, 1].argmin()) if closed else len(piece) // 2
+            places.append((float(piece[at, 0]), float(piece[at, 1])))
+    if places:
+        labels = axes.clabel(lines, fmt=_short, fontsize=7, inline=False, manual=places)
+        for label in labels:
+            label.set_path_effects(_halo())
+            label.set_clip_on(True)
     return lines
 
 
@@ -250,7 +269,7 @@ def _draw_residuals(
     lengths = np.linalg.norm(means, axis=1)
     is_binned = len(places) > 0 and len(pixels) > _MOST_ARROWS
     what = "mean residuals" if is_binned else "residuals"
-    if not len(places) or not lengths.max() > 0:
+    if not len(places) or lengths.max() < _NOTHING_PX:
         axes.set_title(what, fontsize=9)
         _say(axes, "no residuals" if not len(places) else "all residuals are zero")
         return
@@ -277,9 +296,9 @@ def _draw_residuals(
     # The scale bar stands below the image, with what the colours mean.
     known_px = nice(0.12 * camera.width_px / times)
     note = f"= {known_px:g} px"
-    if is_binned:
-        n_systematic = int(systematic.sum())
-        note += f"   |   {n_systematic} of {len(places)} cells (orange) more than noise explains"
+    if is_binned and noise_px > 0:
+        times_noise = np.sqrt((counts * lengths**2).mean() / 2.0) / noise_px
+        note += f"   |   {times_noise:.1f} times those of noise alone; orange: not noise"
     axes.set_xlabel(note, fontsize=8, color=_INK, x=0.16, ha="left")
     axes.annotate(
         "",
@@ -336,8 +355,8 @@ def _draw_histogram(axes: Axes, residuals_px: NDArray[np.float64], noise_px: flo
     values = residuals_px.ravel()
     if not len(values):
         return
-    unit_px = noise_px if noise_px > 0 else float(values.std())
-    if not unit_px > 0:
+    unit_px = noise_px if noise_px > _NOTHING_PX else float(values.std())
+    if unit_px < _NOTHING_PX:
         return
     scaled = values / unit_px
     edges = np.linspace(-_HISTOGRAM_END, _HISTOGRAM_END, 41)
@@ -389,11 +408,11 @@ def draw_errors(rig: Rig, volume: Volume) -> Figure | None:
     if not len(known):
         return None
     figure = _new_figure(11.0, 3.95)
-    least, most = float(known.min()), float(np.quantile(known, 0.98))
+    least, most = float(known.min()), float(np.quantile(known, 0.95))
     if not most > least:
         least, most = 0.0, max(most, 1e-9)
     levels = spread_levels(errors_mm, 6)
-    colours = ScalarMappable(Normalize(least, most), _ERROR_COLOURS)
+    scale = Normalize(least, most)
     for number, ((what, _), height_m, layer) in enumerate(zip(_SLICES, z, errors_mm, strict=True)):
         axes = figure.add_axes((0.052 + 0.298 * number, 0.115, 0.28, 0.81))
         half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
@@ -413,8 +432,8 @@ def draw_errors(rig: Rig, volume: Volume) -> Figure | None:
         )
         axes.imshow(
             np.ma.masked_invalid(layer),
-            cmap=colours.cmap,
-            norm=colours.norm,
+            cmap=_ERROR_COLOURS,
+            norm=scale,
             extent=box,
             origin="lower",
             interpolation="nearest",
@@ -431,7 +450,7 @@ def draw_errors(rig: Rig, volume: Volume) -> Figure | None:
         else:
             axes.set_yticklabels([])
     bar = figure.colorbar(
-        colours,
+        ScalarMappable(scale, _ERROR_COLOURS),
         cax=figure.add_axes((0.95, 0.17, 0.012, 0.65)),
         extend="max" if known.max() > most else "neither",
     )
@@ -447,7 +466,7 @@ def _frame_from_above(axes: Axes, rig: Rig, volume: Volume) -> None:
     centers = rig.centers_world[:, :2]
     reach = np.concatenate([centers, [low, high]]).clip(low - size, high + size)
     middle = (reach.min(axis=0) + reach.max(axis=0)) / 2.0
-    half = 0.5 * float(np.ptp(reach, axis=0).max()) * 1.22
+    half = 0.5 * float(np.ptp(reach, axis=0).max()) * 1.3
     axes.set_xlim(middle[0] - half, middle[0] + half)
     axes.set_ylim(middle[1] - half, middle[1] + half)
     axes.set_aspect("equal")
@@ -469,7 +488,7 @@ def _draw_cameras_from_above(axes: Axes, rig: Rig) -> None:
         inside = ((center >= low) & (center <= high)).all()
         shown = center.clip(low, high)
         if inside:
-            rim = _frustum(camera, 0.09 * span)[:, :2]
+            rim = frustum(camera, 0.09 * span)[:, :2]
             wedges += [np.stack([center, rim[corner]]) for corner in _corners(rim)]
             wedges.append(rim)
             axes.plot(*shown, "o", color=_INK, markersize=3.5, zorder=5)
@@ -491,7 +510,7 @@ _RIM_STEPS = 5
 _WIDE = 2.0
 
 
-def _frustum(camera: Camera, length_m: float) -> NDArray[np.float64]:
+def frustum(camera: Camera, length_m: float) -> NDArray[np.float64]:
     """Return the rim of what a camera sees, as far as `length_m`: (4 * steps + 1, 3) world."""
     steps = np.linspace(0.0, 1.0, _RIM_STEPS, endpoint=False)
     corners = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)])
@@ -570,7 +589,7 @@ def _scene(rig: Rig, volume: Volume) -> _Scene:
     length_m = 0.22 * max(float(np.median(distances_m)), 1e-3)
     frusta = []
     for camera in rig.cameras:
-        rim = _frustum(camera, length_m)
+        rim = frustum(camera, length_m)
         frusta.append(rim)
         frusta += [np.stack([camera.center_world, rim[corner]]) for corner in _corners(rim)]
         # A roof over the upper border tells which way up the camera is.
@@ -647,7 +666,7 @@ def _draw_scene(axes: Axes, scene: _Scene, img_from_world: _Map) -> None:
     places = img_from_world(np.concatenate([scene.centers, scene.axes]))
     axes.plot(*places[: len(scene.names)].T, "o", color=_INK, markersize=3.5)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.08)
+    axes.margins(0.1)
     axes.apply_aspect()
     _place_names(
         axes, places, [*scene.names, *"xyz"[: len(scene.axes)]], img_from_world(scene.rims)
@@ -676,7 +695,7 @@ def _place_names(
         ]
     middle = points.mean(axis=0)
     for name, place, point in zip(names, places, points, strict=True):
-        half = np.array([0.31 * len(name), 0.58]) * size_pt
+        half = np.array([0.34 * len(name), 0.58]) * size_pt
         outwards = (point - middle) / max(float(np.linalg.norm(point - middle)), 1e-9)
         best: tuple[float, NDArray[np.float64]] | None = None
         for reach in (5.0, 11.0):

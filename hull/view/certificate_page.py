@@ -7,7 +7,8 @@ the same file to the byte.
 import base64
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, Literal
@@ -30,7 +31,7 @@ State = Literal["good", "limits", "refused"]
 #: By state: a sign, words, the colour and the style of the border.
 _STATES: dict[State, tuple[str, str, str, str]] = {
     "good": ("\u2713", "good", "#00684A", "solid"),
-    "limits": ("!", "good, with limits", "#8A5A00", "dashed"),
+    "limits": ("!", "usable, with limits", "#8A5A00", "dashed"),
     "refused": ("\u2715", "refused", "#B00020", "double"),
 }
 
@@ -46,7 +47,7 @@ _UNKNOWN = '<span class="none">unknown</span>'
 _STYLE = """
 :root { color-scheme: light; }
 body { background: #fff; color: #222; max-width: 1120px; margin: 0 auto; padding: 1.2rem;
-       font: 15px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
+       font: .94rem/1.45 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
 h1 { font-size: 1.15rem; font-weight: 600; margin: 0 0 .8rem; color: #444; }
 h2 { font-size: 1.2rem; margin: 2.2rem 0 .5rem; border-bottom: 1px solid #ccc; }
 h3 { font-size: 1rem; margin: 1.2rem 0 .2rem; }
@@ -78,7 +79,9 @@ details { margin: .25rem 0; }
 details > :not(summary) { margin-left: 1rem; }
 summary { cursor: pointer; }
 @media print {
-  body { max-width: none; padding: 0; font-size: 11px; }
+  html { font-size: 9.5px; }
+  body { max-width: none; padding: 0; }
+  .scroll { overflow: visible; }
   figure, tr, .verdict, .numbers div { break-inside: avoid; }
   h2, h3 { break-after: avoid; }
   details::details-content { content-visibility: visible; block-size: auto; }
@@ -130,9 +133,10 @@ def write_certificate_page(
     names = [camera.name for camera in rig.cameras]
     if names != [told.name for told in certificate.cameras]:
         raise ValueError(f"the certificate is not that of the cameras {', '.join(names)}")
-    with mpl.rc_context(
-        {"svg.fonttype": "path", "svg.hashsalt": "hybridve", "path.simplify": True}
-    ):
+    svg = mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": "hybridve"})
+    with svg, warnings.catch_warnings():
+        # Letters that the font of the figures lacks become boxes there; the page's text has them.
+        warnings.filterwarnings("ignore", "Glyph .* missing from")
         sections = [
             _verdict(rig, certificate, title, max_error_m),
             _limits(certificate),
@@ -204,12 +208,14 @@ def _mm(length_m: float) -> str:
     return f"{_number(1000 * length_m)} mm" if math.isfinite(length_m) else _UNKNOWN
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]], n_text: int = 1) -> str:
-    """Return a table of cells that are HTML; beyond the first `n_text` columns, numbers."""
+def _table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], numeric: Collection[int] = ()
+) -> str:
+    """Return a table of cells that are HTML; numeric columns stand to the right."""
 
     def cells(tag: str, row: Sequence[str]) -> str:
         return "".join(
-            f"<{tag}>{cell}</{tag}>" if column < n_text else f'<{tag} class="n">{cell}</{tag}>'
+            f'<{tag} class="n">{cell}</{tag}>' if column in numeric else f"<{tag}>{cell}</{tag}>"
             for column, cell in enumerate(row)
         )
 
@@ -259,16 +265,16 @@ def _verdict(rig: Rig, certificate: Certificate, title: str, max_error_m: float 
         ),
     ]
     boxes = "\n".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in numbers)
-    warnings = ""
+    listed = ""
     if certificate.warnings:
         items = "\n".join(f"<li>{escape(warning)}</li>" for warning in certificate.warnings)
-        warnings = f'<h3>Look at this</h3>\n<ul class="warnings">\n{items}\n</ul>'
+        listed = f'<h3>Look at this</h3>\n<ul class="warnings">\n{items}\n</ul>'
     return (
         f"<h1>{escape(title)}: certificate of the calibration</h1>\n"
         f'<div class="verdict" style="--cue: {colour}; border-style: {border}">'
         f'<div class="state">{sign} {words}</div>'
         f'<p class="words">{escape(certificate.verdict)}</p>{asked}</div>\n'
-        f'<div class="numbers">\n{boxes}\n</div>\n{warnings}'
+        f'<div class="numbers">\n{boxes}\n</div>\n{listed}'
     )
 
 
@@ -294,7 +300,7 @@ def _limits(certificate: Certificate) -> str:
                 (f"were {what} known", " less", limit.error95_m, 20 * limit.error95_m / whole),
             )
         ]
-        parts += [f"<p>{words}</p>", _table((), rows, n_text=2)]
+        parts += [f"<p>{words}</p>", _table((), rows)]
         todo.append((limit.camera, limit.advice))
     for told in sorted(certificate.cameras, key=lambda told: told.coverage):
         if told.n_points == 0:
@@ -309,7 +315,15 @@ def _limits(certificate: Certificate) -> str:
 
 def _cameras(rig: Rig, certificate: Certificate) -> str:
     header = (
-        *("camera", "lens", "points", "rms<br>px", "coverage", "stands at<br>x, y, z (m)"),
+        *(
+            "camera",
+            "lens",
+            "image<br>px",
+            "points",
+            "rms<br>px",
+            "coverage",
+            "stands at<br>x, y, z (m)",
+        ),
         *("place<br>&plusmn; mm", "turn &plusmn;<br>mrad (deg)", "image error<br>95 %, px"),
         *("at its worst<br>95 %, px", "not<br>determined"),
     )
@@ -321,7 +335,8 @@ def _cameras(rig: Rig, certificate: Certificate) -> str:
         rows.append(
             (
                 escape(camera.name) + (" (moves)" if camera.name in rig.mounts else ""),
-                f"{camera.model}, {camera.width_px}x{camera.height_px}",
+                camera.model,
+                f"{camera.width_px}x{camera.height_px}",
                 str(told.n_points),
                 _fixed(told.rms_px, 3),
                 _percent(told.coverage),
@@ -335,7 +350,7 @@ def _cameras(rig: Rig, certificate: Certificate) -> str:
         )
     return (
         "<h2>Cameras</h2>\n"
-        + _table(header, rows, n_text=2)
+        + _table(header, rows, range(3, 11))
         + "\n<p class=\"note\">rms: of the residuals' length. Coverage: share of the image's cells "
         "that hold points. &plusmn;: one standard deviation, length or angle. Image error: how far "
         "the image of a point of the working volume is off, and the same for the whole image "
@@ -418,7 +433,7 @@ def _parameters(rig: Rig, certificate: Certificate) -> str:
                 if name in told.undetermined:
                     unit += " <b>not determined</b>"
                 rows.append((label, _to_deviation(value, std), _deviation(std), unit))
-        table = _table(("parameter", "value", "&plusmn; standard deviation", ""), rows)
+        table = _table(("parameter", "value", "&plusmn; standard deviation", ""), rows, (1, 2))
         parts.append(
             f"<details><summary>{escape(camera.name)}: {camera.model}</summary>{table}</details>"
         )
@@ -490,7 +505,7 @@ def _render_mapping(value: Mapping[Any, Any]) -> str:
     if not value:
         return '<span class="none">none</span>'
     rows = [(escape(str(key)), _fold(entry)) for key, entry in value.items()]
-    return _table((), rows, n_text=2)
+    return _table((), rows)
 
 
 def _fold(value: Any) -> str:
@@ -514,7 +529,7 @@ def _render_list(value: Sequence[Any]) -> str:
     elif all(isinstance(entry, Mapping) for entry in value):
         keys = list(dict.fromkeys(key for entry in value for key in entry))
         rows = [[_fold(entry[key]) if key in entry else "" for key in keys] for entry in value]
-        whole = _table([escape(str(key)) for key in keys], rows, n_text=len(keys))
+        whole = _table([escape(str(key)) for key in keys], rows)
         head = f"{len(value)} rows"
     else:
         whole = "<ol>" + "".join(f"<li>{_fold(entry)}</li>" for entry in value) + "</ol>"
