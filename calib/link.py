@@ -42,8 +42,10 @@ _CLEAR_FACTOR = 3.0
 _CLEAR_MARGIN = 0.05
 
 #: A view is left out where it misses the place that the others give its board by this share of the
-#: board's size in the image, and by so many times what its camera misses by in the median.
+#: board's size in the image, and by so many times what its camera misses by in the median. From a
+#: smaller share on it is asked whether another view places the board better.
 _LEFT_OUT_SHARE = 0.1
+_DOUBTFUL_SHARE = 0.02
 _LEFT_OUT_MEDIANS = 5.0
 
 #: A clip that misses its lens by more than so many times what the stills do, or than the limit
@@ -653,7 +655,7 @@ def _read_out(chain: _Chain, boards: Sequence[NamedBoard], cameras: Sequence[Cam
         proposed = [chain.in_part(look) for look in looks]
         rig_from_body[key] = _middle_pose(proposed, looks, chain.length_m)
         fits = _fits(chain, looks, proposed, rig_from_body[key])
-        if any(missed_px > _LEFT_OUT_SHARE * size_px for _, missed_px, size_px in fits):
+        if any(missed_px > _DOUBTFUL_SHARE * size_px for _, missed_px, size_px in fits):
             # A board whose tilt was taken for the other one that a plane allows fits its own image
             # only: the right pose fits all.
             trials = [

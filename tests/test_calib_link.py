@@ -424,10 +424,11 @@ def test_a_view_that_disagrees_is_left_out_and_named() -> None:
     assert "px" in linked.left_out[name]
 
 
-def test_a_tilt_taken_for_the_other_is_put_right_by_the_other_camera() -> None:
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_a_tilt_taken_for_the_other_is_put_right_by_the_other_camera(wrong: int) -> None:
     recording = passing_by(2, per_camera=8)
-    lens = recording.lenses[0]
-    shared = {s.image for s in recording.observations[1].sightings}
+    lens = recording.lenses[wrong]
+    shared = {s.image for s in recording.observations[1 - wrong].sightings}
     image = next(image for image, _ in sorted(lens.views) if image in shared)
     pose = lens.views[image, 0]
     # Mirror the board's normal at the ray through its middle: nearly the same image.
