@@ -1,88 +1,70 @@
-"""From pictures of a board to a rig: observe, fit each lens, label, adjust everything at once.
+"""From pictures of boards to a rig that can be trusted: observe, fit, link, adjust, certify.
 
-Each camera's lens is fitted to stills of the board; views that are blurred or wrong show by their
-own error and are dropped. The rig follows from a clip that shows the board to all cameras: lying
-still, then the clip is averaged, or being moved, then each frame ties the cameras together. At the
-end one bundle adjustment refines lenses, poses and boards from all views together. Seeing
-(`observe_board`) and solving (`solve_rig`) are apart, so that pictures are searched once.
+::
 
-The world is the board: Z points away from its printed side, so cameras are above the floor on
-which it lies. A board that looks the same when turned leaves open which way round each camera saw
-it; what the cameras see around the board decides that (see `hybridve.calib.check`), and corners
-given by hand vote with the order in which they are listed.
+    pictures -> Observations -> lenses -> labels, clocks -> linked cameras -> joint adjustment
+                                                                                   |
+                                certificate <- rig with its covariance <- world <--+
+
+Each camera's lens is fitted to all that it saw of the boards; views that are blurred or wrong show
+by their own error and are dropped. The rig follows from a clip that shows boards to all cameras:
+lying still, then the clip is averaged, or being moved, then each frame ties the cameras together.
+Seeing (`observe_boards`) and solving (`solve_rig`) are apart, so that pictures are searched once.
 """
 
 import importlib.metadata
 import logging
-import os
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import combinations
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.camera import N_PARAMS, Camera
-from hybridve.calib.check import choose_looks, count_agreeing, describe_scene
+from hybridve.calib.board import Observations, is_seen
+from hybridve.calib.bundle import POSE, Adjusted, Bundle, BundleView, adjust
+from hybridve.calib.camera import Camera
+from hybridve.calib.clock import estimate_offsets, resampled
+from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.image_io import FrameSource, natural_order
+from hybridve.calib.hand_eye import mount_camera
+from hybridve.calib.image_io import natural_order
+from hybridve.calib.labelling import label_still_boards
+from hybridve.calib.lens_choice import choose_shared_lens
+from hybridve.calib.lens_fit import FittedLens, LensSettings, fit_shared_lens, locate_board, rms
+from hybridve.calib.link import Linked, NamedBoard, link_cameras
+from hybridve.calib.observe import CameraInput, ObserveSettings, observe_boards
 from hybridve.calib.pose import Pose, compose, invert
-from hybridve.calib.rig import Rig
-from hybridve.calib.solve import (
-    Adjustment,
-    BoardView,
-    FittedLens,
-    adjust,
-    fit_lens,
-    link_cameras,
-    locate_board,
-    rms,
+from hybridve.calib.rig import Mount, Rig, RigCovariance
+from hybridve.calib.uncertainty import (
+    Noise,
+    camera_parameter_names,
+    measure_noise,
+    rig_covariance,
 )
-from hybridve.calib.target import (
-    Chessboard,
-    Detection,
-    detect_corners,
-    list_corners,
-    read_corners,
-    refine_corners,
-)
+from hybridve.calib.world import Mark, SeenBoards, place_world
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 
-T = TypeVar("T")
+#: A lens whose model is chosen by its views.
+AUTO_MODEL = "auto"
 
+#: A point is an outlier of the joint adjustment if it misses by so many times the noise of its
+#: camera (a normal error does so once in 300,000 points), and by more than this.
+_OUTLIER_SIGMAS = 5.0
+_OUTLIER_PX = 0.2
 
-@dataclass(frozen=True, slots=True)
-class CameraInput:
-    """What was recorded of the board by one camera.
+#: A still board that misses its lens by more than this after all is another camera's.
+_WRONG_CLIP_PX = 5.0
 
-    Attributes
-    ----------
-    name : str
-        Unique within the rig.
-    model : str
-        A COLMAP camera model, a key of `hybridve.calib.camera.N_PARAMS`.
-    intrinsics : FrameSource or None
-        The board in many places, in this camera alone. None: the views of `extrinsics` serve,
-        if the board moves there.
-    extrinsics : FrameSource or None
-        The board as all cameras see it at once, frame by frame.
-    corners : Path or None
-        Corners marked by hand in `extrinsics`, see `read_corners`; taken where detection fails.
-    """
+#: Where the two poses that a plane allows differ in error by less than this factor, its tilt is
+#: not determined.
+_TILT_FACTOR = 1.5
 
-    name: str
-    model: str
-    intrinsics: FrameSource | None
-    extrinsics: FrameSource | None
-    corners: Path | None
+#: Outliers that are listed one by one.
+_TOLD_OUTLIERS = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,800 +73,618 @@ class CalibrationSettings:
 
     Attributes
     ----------
-    max_view_px : float
-        A view whose corners miss by more than this, root mean square, is dropped.
-    max_view_medians : float
-        So is one that misses by this many times the median of its camera's views, ...
-    always_good_px : float
-        ... unless it misses by no more than this.
-    min_views : int
-        Views a lens is fitted to at least.
-    max_stills : int
-        Stills looked at, evenly spread over what there is.
-    enough_stills : int
-        With fewer stills found by the quick search, the others are searched again with more
-        effort.
-    clip_frames : int
-        Frames of the extrinsic clip looked at, evenly spread.
-    still_px : float
-        A board that moves less than this in the clip lies still, and the clip is averaged.
-    loss_px : float
-        Corners that miss by more than this weigh less than squared.
-    threads : int
-        Images searched at the same time; 0 for as many as there are processors.
+    observe : ObserveSettings
+        How pictures are searched.
+    lens : LensSettings
+        How lenses are fitted.
+    world : "board", "points" or "floor"
+        What defines the world: the board (z up from its printed side), points whose places are
+        known, or the floor.
+    marks : tuple of Mark
+        Points for the latter two.
+    sync : "given" or "estimate"
+        Whether the cameras' clocks are to be trusted, frame by frame.
     """
 
-    max_view_px: float = 1.0
-    max_view_medians: float = 3.0
-    always_good_px: float = 0.5
-    min_views: int = 3
-    max_stills: int = 120
-    enough_stills: int = 20
-    clip_frames: int = 40
-    still_px: float = 1.0
-    loss_px: float = 1.0
-    threads: int = 0
+    observe: ObserveSettings = field(default_factory=ObserveSettings)
+    lens: LensSettings = field(default_factory=LensSettings)
+    world: Literal["board", "points", "floor"] = "board"
+    marks: tuple[Mark, ...] = ()
+    sync: Literal["given", "estimate"] = "given"
 
 
 _DEFAULTS = CalibrationSettings()
 
-#: Frames in which the stillness of an averaged clip is measured.
-_SPREAD_FRAMES = 9
-
-#: Frames whose means over 15x15 pixels differ by less show the same.
-_STILL_GREY = 8.0
-
-#: Bytes of grey frames of one clip held at once; larger images are averaged over fewer frames.
-_CLIP_BYTES = 200_000_000
-
-#: An order of corners that was given by hand counts as this many agreeing matches of the scene.
-_HAND_VOTES = 10.0
-
-#: Evidence below this many standard deviations (of counts of chance matches) is called weak.
-_WEAK_EVIDENCE = 3.0
-
-#: Where the two poses that a plane allows differ in error by less than this factor, its tilt is
-#: not determined.
-_TILT_FACTOR = 1.5
-
-#: A board clip that misses its lens by this many times `max_view_px` is another camera's.
-_WRONG_CLIP_FACTOR = 5.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stills:
-    """The board in the stills of one camera.
+class LensRequest:
+    """What is asked of one camera's lens beyond its model.
 
     Attributes
     ----------
-    size_px : (width, height) or None
-        Of the stills; None where there are none.
-    corners : dict of str to (N, 2) float64
-        By the name of a still the board's corners, pixels.
-    missed : dict of str to str
-        Stills that do not count, and why.
+    group : str or None
+        Cameras of one group share a lens.
+    params : tuple of float, or None
+        Its parameters, if they are known.
     """
 
-    size_px: tuple[int, int] | None
-    corners: dict[str, NDArray[np.float64]]
-    missed: dict[str, str]
+    group: str | None = None
+    params: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Clip:
-    """The board in the extrinsic clip of one camera.
+class Calibration:
+    """A rig and what it was made from.
 
     Attributes
     ----------
-    size_px : (width, height)
-        Of its frames.
-    corners : dict of int to (N, 2) float64
-        By frame the board's corners, pixels; one frame, 0, where the board lies still.
-    is_still : bool
-        Whether it does, so that the clip could be averaged.
-    picture : (H, W) float32, or None
-        The average of a still clip, in grey levels.
-    how : str
-        How the corners were found.
-    spread_px : float or None
-        How far the worst corner strays from frame to frame (median over frames).
-    hand_look : int or None
-        Which look of the board was listed by hand, if one was.
+    rig : Rig
+        With its covariance; ``provenance`` holds errors per camera, what was dropped and why.
+    noise : Noise
+        How noisy the points of boards were.
+    pixels, residuals_px : dict of str to (K, 2) float64
+        By camera all points that were used, and observed minus projected.
     """
 
-    size_px: tuple[int, int]
-    corners: dict[int, NDArray[np.float64]]
-    is_still: bool
-    picture: NDArray[np.float32] | None = None
-    how: str = "given"
-    spread_px: float | None = None
-    hand_look: int | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observations:
-    """All that one camera saw of the board; what a rig is solved from."""
-
-    name: str
-    model: str
-    stills: Stills
-    clip: Clip
-    sources: dict[str, str | None] = field(default_factory=dict)
+    rig: Rig
+    noise: Noise
+    pixels: dict[str, NDArray[np.float64]]
+    residuals_px: dict[str, NDArray[np.float64]]
 
 
 def calibrate_rig(
-    board: Chessboard,
-    cameras: list[CameraInput],
+    boards: Sequence[NamedBoard],
+    cameras: Sequence[CameraInput],
     settings: CalibrationSettings = _DEFAULTS,
     progress: Progress | None = None,
-) -> Rig:
-    """Calibrate lenses and poses of fixed cameras from pictures of a chessboard.
+    cache: CornerCache | None = None,
+    tracks: Mapping[str, Mapping[int, Pose]] | None = None,
+) -> Calibration:
+    """Calibrate lenses and poses of cameras from pictures of boards.
 
     Parameters
     ----------
-    board : Chessboard
-        The board in all pictures.
-    cameras : list of CameraInput
+    boards : sequence of NamedBoard
+        The boards in all pictures.
+    cameras : sequence of CameraInput
         The cameras; their order does not matter.
     settings : CalibrationSettings
         How it is done.
     progress : callable, optional
         Called with what is being done, how many of it are done, and how many there are.
+    cache : CornerCache, optional
+        What was found in the pictures before.
+    tracks : mapping of str to mapping of int to (3, 4) float64, optional
+        For cameras that move: tracking_from_tracker by frame of their board clip.
 
     Returns
     -------
-    rig : Rig
-        In the order of `cameras`. The world is the board in the still clip (in a moving clip: in
-        the first frame that most cameras see), metres, Z up. ``provenance`` holds the errors per
-        camera, the views that were dropped and why, and what decided how a symmetric board lies.
+    Calibration
+        Its rig is in the order of `cameras`, in the world of `CalibrationSettings.world`, metres,
+        Z up.
 
     Raises
     ------
     CalibrationError
-        Naming the camera, and what was tried, where no board is found, too few views fit, or a
-        camera shares no view of the board with the others.
+        Naming the camera, what was found and what to do, where no board is found, too few views
+        fit, a lens is not determined, or a camera cannot be linked to the others.
     """
-    return solve_rig(board, observe_board(board, cameras, settings, progress), settings, progress)
-
-
-# --- What the pictures show -----------------------------------------------------------------
-
-
-def observe_board(
-    board: Chessboard,
-    cameras: list[CameraInput],
-    settings: CalibrationSettings = _DEFAULTS,
-    progress: Progress | None = None,
-) -> list[Observations]:
-    """Find the board in all pictures: the slow half of `calibrate_rig`, and its parameters."""
-    report = progress or _no_progress
-    _check_inputs(cameras)
-    threads = settings.threads or os.cpu_count() or 1
-    with ThreadPoolExecutor(threads) as pool:
-        clips = _observe_clips(board, cameras, settings, pool, report)
-        stills = [
-            _observe_stills(board, camera, settings, pool, 2 * threads, report)
-            for camera in cameras
-        ]
-    return [
-        Observations(
-            camera.name,
-            camera.model,
-            still,
-            clip,
-            {
-                "intrinsics": camera.intrinsics.label if camera.intrinsics else None,
-                "extrinsics": camera.extrinsics.label if camera.extrinsics else None,
-                "corners": camera.corners.name if camera.corners else None,
-            },
-        )
-        for camera, still, clip in zip(cameras, stills, clips, strict=True)
-    ]
-
-
-def find_board(
-    board: Chessboard,
-    cameras: list[CameraInput],
-    settings: CalibrationSettings = _DEFAULTS,
-    progress: Progress | None = None,
-) -> dict[str, NDArray[np.float64]]:
-    """Find the board's corners where all cameras see it at once, to check a rig made elsewhere.
-
-    Parameters
-    ----------
-    board : Chessboard
-        The board.
-    cameras : list of CameraInput
-        The cameras; those without extrinsics are left out.
-    settings : CalibrationSettings
-        How it is done.
-    progress : callable, optional
-        Called with what is being done, how many of it are done, and how many there are.
-
-    Returns
-    -------
-    dict of str to (N, 2) float64
-        By camera the corners in pixels, of the averaged clip if the board lies still in it, else
-        of the frame in which most cameras see it.
-
-    Raises
-    ------
-    CalibrationError
-        Naming the camera, and what was tried, where no board is found.
-    """
-    report = progress or _no_progress
-    seeing = [camera for camera in cameras if camera.extrinsics is not None]
-    with ThreadPoolExecutor(settings.threads or os.cpu_count() or 1) as pool:
-        clips = _observe_clips(board, seeing, settings, pool, report)
-    frames = {frame for clip in clips for frame in clip.corners}
-    best = max(sorted(frames), key=lambda frame: sum(frame in clip.corners for clip in clips))
-    return {
-        camera.name: clip.corners[best]
-        for camera, clip in zip(seeing, clips, strict=True)
-        if best in clip.corners
+    requests = {camera.name: LensRequest(camera.lens, camera.params) for camera in cameras}
+    tracks = tracks or {}
+    observe = settings.observe
+    if settings.sync == "estimate":
+        observe = replace(observe, every_clip_frame=True)
+    # A board that lies still does not for a camera that moves: their clips are looked at apart.
+    moving = [camera for camera in cameras if camera.name in tracks]
+    seen = {
+        observed.name: observed
+        for together in ([camera for camera in cameras if camera.name not in tracks], moving)
+        if together
+        for observed in observe_boards(boards, together, observe, progress, cache)
     }
+    if not cameras:
+        raise CalibrationError("there is no camera to calibrate; name at least one")
+    observations = [seen[camera.name] for camera in cameras]
+    return solve_rig(boards, observations, settings, progress, requests, tracks)
+
+
+def solve_rig(
+    boards: Sequence[NamedBoard],
+    observations: Sequence[Observations],
+    settings: CalibrationSettings = _DEFAULTS,
+    progress: Progress | None = None,
+    requests: Mapping[str, LensRequest] | None = None,
+    tracks: Mapping[str, Mapping[int, Pose]] | None = None,
+) -> Calibration:
+    """Solve lenses and poses from the points that were seen: the quick half of `calibrate_rig`."""
+    report = progress or _no_progress
+    requests, tracks = requests or {}, tracks or {}
+    # The rig's numbers must not depend on the order in which cameras are listed.
+    ordered = sorted(observations, key=lambda seen: natural_order(seen.name))
+    fixed = [seen for seen in ordered if seen.name not in tracks]
+    moving = [seen for seen in ordered if seen.name in tracks]
+    about: dict[str, Any] = {}
+    if settings.sync == "estimate" and fixed:
+        fixed = _synchronised(boards, fixed, settings, requests, about)
+    lenses = _fit_lenses(boards, [*fixed, *moving], settings.lens, requests, report)
+    report("adjusting everything", 0, 1)
+    solved = None
+    if fixed:
+        solved = _solve_fixed(boards, fixed, lenses[: len(fixed)], requests, settings, about)
+    mounted = [
+        _mount(boards, seen, lens, tracks[seen.name], solved)
+        for seen, lens in zip(moving, lenses[len(fixed) :], strict=True)
+    ]
+    calibration = _put_together(boards, [*fixed, *moving], lenses, solved, mounted, about, settings)
+    report("adjusting everything", 1, 1)
+    names = [seen.name for seen in observations]
+    return replace(calibration, rig=calibration.rig.only(names))
 
 
 def _no_progress(what: str, done: int, total: int) -> None:
     del what, done, total
 
 
-def _check_inputs(cameras: Sequence[CameraInput]) -> None:
-    if not cameras:
-        raise CalibrationError("there is no camera to calibrate; name at least one")
-    names = [camera.name for camera in cameras]
-    for camera in cameras:
-        if names.count(camera.name) > 1:
-            raise CalibrationError(
-                f"camera {camera.name!r} is listed {names.count(camera.name)} times"
-            )
-        if camera.model not in N_PARAMS:
-            raise CalibrationError(
-                f"camera {camera.name!r}: unknown camera model {camera.model!r}; one of "
-                f"{', '.join(N_PARAMS)}"
-            )
-        if camera.extrinsics is None:
-            raise CalibrationError(
-                f"camera {camera.name!r}: no clip shows it the board together with the other "
-                "cameras; name one as `extrinsics`"
-            )
+# --- Lenses and clocks ------------------------------------------------------------------------
 
 
-def _observe_stills(
-    board: Chessboard,
-    camera: CameraInput,
-    settings: CalibrationSettings,
-    pool: ThreadPoolExecutor,
-    in_flight: int,
-    report: Progress,
-) -> Stills:
-    source = camera.intrinsics
-    if source is None or (camera.extrinsics and source.paths == camera.extrinsics.paths):
-        return Stills(None, {}, {})  # the views of the extrinsic clip serve
-    length = _length(source)
-    step = -(-length // settings.max_stills)
-    total = -(-length // step)
-    sizes: dict[str, tuple[int, int]] = {}
-    corners: dict[str, NDArray[np.float64]] = {}
-    missed: dict[str, str] = {}
-    waiting: deque[tuple[str, Future[Detection]]] = deque()
-
-    def collect(down_to: int) -> None:
-        while len(waiting) > down_to:
-            name, future = waiting.popleft()
-            found = future.result().corners
-            if found is None:
-                missed[name] = "no board found"
-            else:
-                corners[name] = found
-                missed.pop(name, None)
-
-    def search(effort: Literal["quick", "usual"], what: str) -> None:
-        done = 0
-        for done, image in enumerate(source.frames(step=step), start=1):
-            index = (done - 1) * step
-            name = f"frame {index}" if source.is_video else source.paths[index].name
-            sizes[name] = (image.shape[1], image.shape[0])
-            if name not in corners:
-                waiting.append((name, pool.submit(detect_corners, image, board, effort)))
-            collect(in_flight)  # so that memory does not grow with the source
-            report(what, min(done, total), total)
-        collect(0)
-        report(what, total, total)  # a video may end before its header says
-
-    search("quick", f"stills of {camera.name}")
-    if not sizes:
-        raise CalibrationError(f"camera {camera.name!r}: {source.label} holds no picture")
-    if missed and len(corners) < settings.enough_stills:
-        search("usual", f"stills of {camera.name}, again")
-    corners = {name: corners[name] for name in sizes if name in corners}  # in their own order
-    logger.info("camera %s: board found in %d of %d stills", camera.name, len(corners), len(sizes))
-    counts = Counter(sizes.values())
-    size_px = max(counts, key=lambda size: (counts[size], size))
-    for name in [name for name in corners if sizes[name] != size_px]:
-        del corners[name]
-        missed[name] = "is {}x{} pixels, most are {}x{}".format(*sizes[name], *size_px)
-    return Stills(size_px, corners, missed)
-
-
-def _length(source: FrameSource) -> int:
-    """Return how many frames there are, about; some videos do not say."""
-    claimed = source.claimed_length()
-    return claimed if claimed > 0 else max(1, source.count())
-
-
-def _observe_clips(
-    board: Chessboard,
-    cameras: Sequence[CameraInput],
-    settings: CalibrationSettings,
-    pool: ThreadPoolExecutor,
-    report: Progress,
-) -> list[Clip]:
-    sources = [camera.extrinsics for camera in cameras if camera.extrinsics is not None]
-    # One step for all cameras: frames with the same number were taken at the same time.
-    step = -(-min(map(_length, sources)) // settings.clip_frames)
-    still = [
-        pool.submit(_observe_still_clip, board, camera, source, step, settings)
-        for camera, source in zip(cameras, sources, strict=True)
-    ]
-    clips = list(_collected(still, "board clips", report))
-    if all(clip is not None for clip in clips):
-        return [clip for clip in clips if clip is not None]
-    logger.info("the board moves in the clips: each frame is looked at")
-    moving = [
-        pool.submit(_observe_moving_clip, board, camera, source, step)
-        for camera, source in zip(cameras, sources, strict=True)
-    ]
-    return list(_collected(moving, "clips with a moving board", report))
-
-
-def _collected(futures: Sequence[Future[T]], what: str, report: Progress) -> Iterator[T]:
-    report(what, 0, len(futures))
-    for done, future in enumerate(futures, start=1):
-        yield future.result()
-        report(what, done, len(futures))
-
-
-def _observe_still_clip(
-    board: Chessboard,
-    camera: CameraInput,
-    source: FrameSource,
-    step: int,
-    settings: CalibrationSettings,
-) -> Clip | None:
-    """Return the corners averaged over a clip; None if the board moves in it."""
-    frames = _sample(source, step)
-    if not frames:
-        raise CalibrationError(f"camera {camera.name!r}: {source.label} holds no picture")
-    if any(frame.shape != frames[0].shape for frame in frames):
-        raise CalibrationError(
-            f"camera {camera.name!r}: the pictures of {source.label} differ in size"
-        )
-    size_px = (frames[0].shape[1], frames[0].shape[0])
-    picture = _steady_mean(frames)
-    by_hand = _corners_by_hand(board, camera)
-    detection = detect_corners(picture, board, "quick")
-    if detection.corners is None:
-        if _moves(board, frames, settings):
-            return None
-        detection = detect_corners(picture, board)
-    corners, how = detection.corners, f"detected ({detection.how})"
-    if corners is None and by_hand is not None:
-        corners = refine_corners(picture, board, by_hand)
-        how = "marked by hand, refined"
-        if corners is None:
-            corners, how = by_hand, "marked by hand, not refined: no chessboard at that place"
-        logger.warning(
-            "camera %s: no board found in %s (%s); corners %s",
-            camera.name,
-            source.label,
-            detection.how,
-            how,
-        )
-    if corners is None:
-        raise CalibrationError(
-            f"camera {camera.name!r}: no board of {board.columns}x{board.rows} inner corners found "
-            f"in {source.label} (average of {len(frames)} frames; {detection.how}); check columns "
-            "and rows, or mark the corners by hand (`corners`)"
-        )
-    spread_px = _spread(board, frames, corners)
-    if spread_px is not None and spread_px > settings.still_px and by_hand is None:
-        return None
-    hand_look = None
-    if by_hand is not None:
-        misses = [float(np.abs(corners[look] - by_hand).max()) for look in board.looks]
-        hand_look = int(np.argmin(misses))
-        sides = np.linalg.norm(np.diff(by_hand.reshape(board.rows, -1, 2), axis=1), axis=-1)
-        if min(misses) > float(sides.max()):
-            logger.warning(
-                "camera %s: the corners marked by hand are %.0f px away from those found in %s; "
-                "those found are taken",
-                camera.name,
-                min(misses),
-                source.label,
-            )
-            hand_look = None
-    return Clip(size_px, {0: corners}, True, picture, how, spread_px, hand_look)
-
-
-def _sample(source: FrameSource, step: int) -> list[NDArray[np.uint8]]:
-    """Return every `step`-th frame in grey, fewer where frames are large."""
-    frames: list[NDArray[np.uint8]] = []
-    for image in source.frames(step=step):
-        if len(frames) > 4 and (len(frames) + 1) * image.shape[0] * image.shape[1] > _CLIP_BYTES:
-            break
-        frames.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
-    return frames
-
-
-def _steady_mean(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-    """Return the mean of the middle half of each pixel's values, (H, W) float32.
-
-    Somebody who crosses the picture, for less than a quarter of the clip, leaves no trace; unlike
-    a median the mean resolves less than a grey level.
-    """
-    quarter = len(frames) // 4
-    mean = np.zeros(frames[0].shape, np.float32)
-    for row in range(0, len(mean), 64):  # in strips, to sort little memory at a time
-        strip = np.sort(np.stack([frame[row : row + 64] for frame in frames]), axis=0)
-        mean[row : row + 64] = strip[quarter : len(frames) - quarter].mean(axis=0)
-    return mean
-
-
-def _moves(
-    board: Chessboard, frames: Sequence[NDArray[np.uint8]], settings: CalibrationSettings
-) -> bool:
-    """Tell whether the board is found in different places of a clip's first, middle, last frame."""
-    chosen = sorted({0, len(frames) // 2, len(frames) - 1})
-    change = max(
-        float(cv2.blur(cv2.absdiff(frames[0], frames[index]), (15, 15)).max()) for index in chosen
-    )
-    if change < _STILL_GREY:
-        return False  # spares the search in three pictures that are the same but for noise
-    found = [detect_corners(frames[index], board, "usual").corners for index in chosen]
-    seen = [corners for corners in found if corners is not None]
-    return any(np.abs(a - b).max() > settings.still_px for a, b in combinations(seen, 2))
-
-
-def _spread(
-    board: Chessboard, frames: Sequence[NDArray[np.uint8]], corners: NDArray[np.float64]
-) -> float | None:
-    """Return how far the worst corner strays, median over frames; inf where most show no board."""
-    if len(frames) == 1:
-        return None
-    chosen = np.linspace(0, len(frames) - 1, min(_SPREAD_FRAMES, len(frames))).round().astype(int)
-    again = [refine_corners(frames[index], board, corners) for index in chosen]
-    strays = [np.inf if seen is None else float(np.abs(seen - corners).max()) for seen in again]
-    return float(np.median(strays))
-
-
-def _corners_by_hand(board: Chessboard, camera: CameraInput) -> NDArray[np.float64] | None:
-    if camera.corners is None:
-        return None
-    corners = read_corners(camera.corners)
-    expected = board.columns * board.rows
-    if len(corners) != expected:
-        raise CalibrationError(
-            f"{camera.corners}: {len(corners)} corners, expected {expected} "
-            f"({board.columns}x{board.rows} inner corners)"
-        )
-    listed = list_corners(board, corners)
-    if listed is None:
-        raise CalibrationError(
-            f"{camera.corners}: the corners do not form the board's grid; expected row by row, "
-            f"{board.columns} a row"
-        )
-    return listed
-
-
-def _observe_moving_clip(
-    board: Chessboard, camera: CameraInput, source: FrameSource, step: int
-) -> Clip:
-    corners: dict[int, NDArray[np.float64]] = {}
-    size_px = (0, 0)
-    count = 0
-    for index, image in enumerate(source.frames(step=step)):
-        size_px = (image.shape[1], image.shape[0])
-        count += 1
-        found = detect_corners(image, board, "usual").corners
-        if found is not None:
-            corners[index * step] = found
-    if not corners:
-        raise CalibrationError(
-            f"camera {camera.name!r}: no board of {board.columns}x{board.rows} inner corners found "
-            f"in any of {count} frames of {source.label}; check columns and rows"
-        )
-    return Clip(size_px, corners, False, how=f"detected in {len(corners)} of {count} frames")
-
-
-# --- From corners to a rig ------------------------------------------------------------------
-
-
-def solve_rig(
-    board: Chessboard,
+def _fit_lenses(
+    boards: Sequence[NamedBoard],
     observations: Sequence[Observations],
-    settings: CalibrationSettings = _DEFAULTS,
-    progress: Progress | None = None,
-) -> Rig:
-    """Solve lenses and poses from the corners that were seen: the quick half of `calibrate_rig`."""
-    report = progress or _no_progress
-    # The rig's numbers must not depend on the order in which cameras are listed.
-    ordered = sorted(observations, key=lambda seen: natural_order(seen.name))
-    lenses = []
-    for index, seen in enumerate(ordered):
-        report("fitting lenses", index, len(ordered))
-        lenses.append(_fit_lens(board, seen, settings))
-    report("fitting lenses", len(ordered), len(ordered))
-    report("adjusting everything", 0, 1)
-    clips = [seen.clip for seen in ordered]
-    labelling: dict[str, Any] = {"looks": len(board.looks), "decided_by": "the board's colours"}
-    if all(clip.is_still for clip in clips):
-        looks, labelling = _label_still_board(board, lenses, clips)
-        clips = [
-            replace(clip, corners={0: clip.corners[0][board.looks[look]]})
-            for clip, look in zip(clips, looks, strict=True)
-        ]
-    elif len(board.looks) > 1:
-        labelling["decided_by"] = "poses common to all frames"
-    placed, result, views, n_common = _adjust_all(board, lenses, clips, settings)
-    provenance = _provenance(
-        board, ordered, lenses, labelling, settings, views, n_common, result, placed
-    )
-    report("adjusting everything", 1, 1)
-    by_name = {camera.name: camera for camera in placed}
-    return Rig(tuple(by_name[seen.name] for seen in observations), provenance)
+    settings: LensSettings,
+    requests: Mapping[str, LensRequest],
+    report: Progress,
+) -> list[FittedLens]:
+    """Fit each lens to the views of all cameras that share it; one result a camera."""
+    groups: dict[str, list[Observations]] = {}
+    for seen in observations:
+        group = requests.get(seen.name, LensRequest()).group
+        # A lens of its own is called by a name that no group can have.
+        groups.setdefault(f"{seen.name}/" if group is None else group, []).append(seen)
+    fitted: dict[str, FittedLens] = {}
+    for done, members in enumerate(groups.values()):
+        report("fitting lenses", done, len(groups))
+        params = _known_params(members, requests)
+        if members[0].model == AUTO_MODEL:
+            lenses = choose_shared_lens(boards, members, settings)
+        else:
+            known = None if params is None else np.array(params, np.float64)
+            lenses = fit_shared_lens(boards, members, settings, known)
+        fitted |= {seen.name: lens for seen, lens in zip(members, lenses, strict=True)}
+    report("fitting lenses", len(groups), len(groups))
+    return [fitted[seen.name] for seen in observations]
 
 
-def _fit_lens(board: Chessboard, seen: Observations, settings: CalibrationSettings) -> FittedLens:
-    stills, clip = seen.stills, seen.clip
-    if stills.size_px is not None and stills.size_px != clip.size_px:
-        raise CalibrationError(
-            "camera {!r}: intrinsics are {}x{} pixels, extrinsics {}x{}; record both in the same "
-            "mode".format(seen.name, *stills.size_px, *clip.size_px)
-        )
-    views = dict(stills.corners)
-    if not clip.is_still:
-        views |= {_clip_view(frame): corners for frame, corners in clip.corners.items()}
-    if len(views) < settings.min_views:
-        found = f"in {len(views)} of {len(views) + len(stills.missed)} stills"
-        if stills.size_px is None:
-            found = "only lying still in the clip that all cameras see"
-        raise CalibrationError(
-            f"camera {seen.name!r}: the board of {board.columns}x{board.rows} inner corners was "
-            f"found {found}, expected {settings.min_views} views or more to fit a lens; check "
-            "columns and rows, or take more pictures of it (`intrinsics`)"
-        )
-
-    def limit_px(errors_px: Sequence[float]) -> float:
-        relative = settings.max_view_medians * float(np.median(errors_px))
-        return min(settings.max_view_px, max(relative, settings.always_good_px))
-
-    lens = fit_lens(
-        board.points_board,
-        seen.name,
-        seen.model,
-        clip.size_px,
-        views,
-        limit_px,
-        settings.min_views,
-        settings.loss_px,
-    )
-    for name, reason in lens.dropped.items():
-        logger.info("camera %s: %s dropped: %s", seen.name, name, reason)
-    return lens
+def _known_params(
+    members: Sequence[Observations], requests: Mapping[str, LensRequest]
+) -> tuple[float, ...] | None:
+    """Return the parameters of a lens that any of its cameras was given."""
+    given = [requests.get(seen.name, LensRequest()).params for seen in members]
+    return next((params for params in given if params is not None), None)
 
 
-def _clip_view(frame: int) -> str:
-    return f"board clip, frame {frame}"
-
-
-def _label_still_board(
-    board: Chessboard, lenses: Sequence[FittedLens], clips: Sequence[Clip]
-) -> tuple[list[int], dict[str, Any]]:
-    """Choose the look of the board in each camera; return looks and evidence."""
-    n_cameras, n_looks = len(lenses), len(board.looks)
-    evidence: dict[str, Any] = {"looks": n_looks, "decided_by": "the board's colours"}
-    looks = [0] * n_cameras
-    if n_looks > 1 and n_cameras > 1:
-        votes, matches = _votes_of_scene(board, lenses, clips)
-        for i, j in combinations(range(n_cameras), 2):
-            hand_i, hand_j = clips[i].hand_look, clips[j].hand_look
-            if hand_i is not None and hand_j is not None:
-                votes[i, j, (hand_j - hand_i) % n_looks] += _HAND_VOTES
-        chosen = choose_looks(votes)
-        looks = list(chosen.looks)
-        names = [lens.camera.name for lens in lenses]
-        by_hand = sum(clip.hand_look is not None for clip in clips) > 1
-        evidence |= {
-            "decided_by": "matches of the scene" + (" and corners by hand" if by_hand else ""),
-            "matches_by_look": matches,
-            "margin_sigma": {
-                name: round(margin, 2)
-                for name, margin in zip(names, chosen.margins_sigma, strict=True)
-            },
-            "weakest_sigma": round(chosen.weakest_sigma, 2),
-            "is_weak": chosen.weakest_sigma < _WEAK_EVIDENCE,
-        }
-        log = logger.warning if evidence["is_weak"] else logger.info
-        log(
-            "the board looks the same turned by %d degrees; %s decide which way round each camera "
-            "saw it, by %.1f sigma at the weakest%s",
-            360 // n_looks,
-            evidence["decided_by"],
-            chosen.weakest_sigma,
-            ": uncertain; check the cameras' distances, mark the corners by hand in one order, or "
-            "use a board with an odd sum of columns and rows"
-            if evidence["is_weak"]
-            else "",
-        )
-    # The world turns with all cameras alike: the first order given by hand sets it, else the way
-    # in which the first camera sees columns run to the right.
-    turn = -looks[0]
-    for clip, look in zip(clips, looks, strict=True):
-        if clip.hand_look is not None:
-            turn = clip.hand_look - look
-            break
-    return [(look + turn) % n_looks for look in looks], evidence
-
-
-def _votes_of_scene(
-    board: Chessboard, lenses: Sequence[FittedLens], clips: Sequence[Clip]
-) -> tuple[NDArray[np.float64], dict[str, list[int]]]:
-    """Count the matches of the scene for each pair of cameras and each look."""
-    poses = [
-        _clip_pose(board, lens.camera, clip)[0] for lens, clip in zip(lenses, clips, strict=True)
-    ]
-    scenes = [
-        describe_scene(lens.camera, pose, clip.picture, board) if clip.picture is not None else None
-        for lens, pose, clip in zip(lenses, poses, clips, strict=True)
-    ]
-    votes = np.zeros((len(lenses), len(lenses), len(board.looks)))
-    matches = {}
-    for i, j in combinations(range(len(lenses)), 2):
-        first, second = scenes[i], scenes[j]
-        if first is not None and second is not None:
-            votes[i, j] = count_agreeing(first, poses[i], second, poses[j], board)
-        pair = f"{lenses[i].camera.name} {lenses[j].camera.name}"
-        matches[pair] = [int(count) for count in votes[i, j]]
-    return votes, matches
-
-
-def _clip_pose(board: Chessboard, camera: Camera, clip: Clip) -> tuple[Pose, float]:
-    """Return cam_from_board of a still clip, and how many times worse the other pose fits."""
-    located = locate_board(camera, board.points_board, clip.corners[0])
-    if located is None:
-        raise CalibrationError(
-            f"camera {camera.name!r}: the lens fitted to its stills cannot have seen the board "
-            "clip; were both recorded by this camera, with the same zoom?"
-        )
-    return located[0], located[2] / max(located[1], 1e-9)
-
-
-def _adjust_all(
-    board: Chessboard,
-    lenses: Sequence[FittedLens],
-    clips: Sequence[Clip],
+def _synchronised(
+    boards: Sequence[NamedBoard],
+    observations: Sequence[Observations],
     settings: CalibrationSettings,
-) -> tuple[tuple[Camera, ...], Adjustment, list[BoardView], int]:
-    """Return cameras in the world, the adjustment, its views, and how many are of the clips."""
-    cameras, boards, views = link_cameras(
-        board,
-        [lens.camera for lens in lenses],
-        [clip.corners for clip in clips],
-        is_labelled=all(clip.is_still for clip in clips),
-    )
-    n_common = len(views)
-    common_frames = [view.frame for view in views]
-    of_clip = {(view.camera, _clip_view(view.frame)) for view in views}
-    frame = max(boards) + 1  # views of the board by single cameras follow the common frames
-    for index, lens in enumerate(lenses):
-        for name, (corners, cam_from_board) in lens.views.items():
-            if (index, name) not in of_clip:
-                views.append(BoardView(index, frame, corners, name))
-                boards[frame] = compose(invert(cameras[index].cam_from_world), cam_from_board)
-                frame += 1
-    result = adjust(board.points_board, cameras, boards, views, settings.loss_px)
-    for view, residuals in zip(views[:n_common], result.residuals_px, strict=False):
-        missed_px = rms(residuals)
-        if missed_px > _WRONG_CLIP_FACTOR * settings.max_view_px and clips[view.camera].is_still:
-            raise CalibrationError(
-                f"camera {cameras[view.camera].name!r}: the board clip misses its lens by "
-                f"{missed_px:.1f} px; were clip and stills recorded by this camera, with the same "
-                "zoom, and is the board the same?"
-            )
-    # The world: the board in the first of the frames that most cameras see.
-    seen = Counter(common_frames)
-    world = max(sorted(seen), key=lambda common: (seen[common], -common))
-    rig_from_world = result.rig_from_board[world]
-    placed = tuple(
-        replace(camera, cam_from_world=_orthonormal(compose(camera.cam_from_world, rig_from_world)))
-        for camera in result.cameras
-    )
-    for camera in placed:
-        if camera.center_world[2] <= 0:
-            raise CalibrationError(
-                f"camera {camera.name!r} came out {-camera.center_world[2]:.2f} m under the floor: "
-                "is its picture mirrored, or did it see another board?"
-            )
-    return placed, result, views, n_common
+    requests: Mapping[str, LensRequest],
+    about: dict[str, Any],
+) -> list[Observations]:
+    """Return observations as clocks that agree would have made them."""
+    if all(seen.is_still for seen in observations):
+        raise CalibrationError(
+            "the cameras' clocks cannot be compared: the boards lie still in the clip; record a "
+            'board that is moved about, or say sync = "given"'
+        )
+    lenses = _fit_lenses(boards, observations, settings.lens, requests, _no_progress)
+    clocks = estimate_offsets(boards, lenses, observations)
+    about["clocks"] = {
+        "reference": clocks.reference,
+        "offset_frames": {
+            name: round(offset, 4) if np.isfinite(offset) else None
+            for name, offset in clocks.offset_frames.items()
+        },
+        "std_frames": {
+            name: round(std, 4) if np.isfinite(std) else None
+            for name, std in clocks.std_frames.items()
+        },
+        "notes": list(clocks.notes),
+    }
+    for note in clocks.notes:
+        logger.warning("clocks: %s", note)
+    return resampled(observations, clocks.offset_frames, boards)
 
 
-def _orthonormal(pose: Pose) -> Pose:
+# --- Fixed cameras ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """Fixed cameras in the world, and what they were adjusted to."""
+
+    adjusted: Adjusted
+    linked: Linked
+    noise: Noise
+    cameras: tuple[Camera, ...]
+    covariance: RigCovariance
+    world_from_rig: Pose
+    outliers: list[dict[str, Any]]
+
+
+def _solve_fixed(
+    boards: Sequence[NamedBoard],
+    observations: Sequence[Observations],
+    lenses: Sequence[FittedLens],
+    requests: Mapping[str, LensRequest],
+    settings: CalibrationSettings,
+    about: dict[str, Any],
+) -> _Solved:
+    is_still = all(seen.is_still for seen in observations)
+    seen: Sequence[Observations] = observations
+    if is_still:
+        cameras = [lens.camera for lens in lenses]
+        seen, about["labelling"] = label_still_boards(boards, cameras, observations)
+        _warn_of_flat_views(boards, cameras, seen)
+    elif any(len(board.looks) > 1 for board in boards):
+        looks = max(len(board.looks) for board in boards)
+        about["labelling"] = {"looks": looks, "decided_by": "poses common to all frames"}
+    linked = link_cameras(boards, lenses, seen, is_labelled=is_still)
+    bundle = _make_bundle(boards, lenses, linked, requests)
+    rough = adjust(bundle, settings.lens.loss_px)
+    if is_still:
+        _refuse_wrong_clips(rough, linked)
+    cleaned, outliers = _without_outliers(rough)
+    adjusted = adjust(cleaned)
+    placed = place_world(
+        settings.world,
+        adjusted.bundle.cameras,
+        _seen_boards(boards, linked, adjusted.bundle),
+        settings.marks,
+    )
+    about["world"] = placed.diagnostics
+    for warning in placed.diagnostics["warnings"]:
+        logger.warning("%s", warning)
+    rig_from_world = invert(placed.world_from_rig)
+    noise = measure_noise(adjusted)
+    return _Solved(
+        adjusted,
+        linked,
+        noise,
+        tuple(
+            replace(camera, cam_from_world=_rigid(compose(camera.cam_from_world, rig_from_world)))
+            for camera in adjusted.bundle.cameras
+        ),
+        rig_covariance(adjusted, noise.smooth_px),
+        placed.world_from_rig,
+        outliers,
+    )
+
+
+def _seen_boards(boards: Sequence[NamedBoard], linked: Linked, bundle: Bundle) -> SeenBoards:
+    return SeenBoards(
+        boards, bundle.body_from_board, bundle.rig_from_body, linked.pose_names, bundle.views
+    )
+
+
+def _make_bundle(
+    boards: Sequence[NamedBoard],
+    lenses: Sequence[FittedLens],
+    linked: Linked,
+    requests: Mapping[str, LensRequest],
+) -> Bundle:
+    """Return the start of the joint adjustment; its frame is that of the body most cameras saw."""
+    held, _, _ = SeenBoards(
+        boards, linked.body_from_board, linked.rig_from_body, linked.pose_names, linked.views
+    ).main()
+    rig_from_held = linked.rig_from_body[held]
+    held_from_rig = invert(rig_from_held)
+    groups: dict[str, int] = {}
+    lens_of = []
+    for lens in lenses:
+        name = lens.camera.name
+        group = requests.get(name, LensRequest()).group
+        lens_of.append(groups.setdefault(f"{name}/" if group is None else group, len(groups)))
+    given = {
+        number
+        for number, lens in zip(lens_of, lenses, strict=True)
+        if requests.get(lens.camera.name, LensRequest()).params is not None
+    }
+    bodies: dict[str, int] = {}
+    for board in sorted(range(len(boards)), key=lambda index: natural_order(boards[index].name)):
+        bodies.setdefault(boards[board].body or f"{boards[board].name}/", board)
+    return Bundle(
+        points_board=tuple(board.points_board for board in boards),
+        cameras=tuple(
+            replace(lens.camera, cam_from_world=_rigid(compose(cam_from_rig, rig_from_held)))
+            for lens, cam_from_rig in zip(lenses, linked.cam_from_rig, strict=True)
+        ),
+        rig_from_body=tuple(
+            np.eye(3, 4) if index == held else compose(held_from_rig, pose)
+            for index, pose in enumerate(linked.rig_from_body)
+        ),
+        body_from_board=linked.body_from_board,
+        views=linked.views,
+        held_pose=held,
+        lens_of=tuple(lens_of),
+        fixed_lenses=frozenset(given),
+        held_boards=frozenset(bodies.values()),
+    )
+
+
+def _rigid(pose: Pose) -> Pose:
     u, _, vt = np.linalg.svd(pose[:, :3])
     return np.column_stack([u @ vt, pose[:, 3]])
 
 
-def _provenance(
-    board: Chessboard,
+def _refuse_wrong_clips(rough: Adjusted, linked: Linked) -> None:
+    for view, missed in zip(rough.bundle.views, rough.residuals_px, strict=True):
+        missed_px = rms(missed[is_seen(missed)])
+        is_clip = isinstance(linked.pose_names[view.pose][0], int)
+        if is_clip and missed_px > _WRONG_CLIP_PX:
+            name = rough.bundle.cameras[view.camera].name
+            raise CalibrationError(
+                f"camera {name!r}: the board clip misses its lens by {missed_px:.1f} px; were clip "
+                "and stills recorded by this camera, with the same zoom, and is the board the same?"
+            )
+
+
+def _warn_of_flat_views(
+    boards: Sequence[NamedBoard], cameras: Sequence[Camera], observations: Sequence[Observations]
+) -> None:
+    """Warn where a still board hardly tells how it is tilted."""
+    for camera, seen in zip(cameras, observations, strict=True):
+        factor = _other_tilt(boards, camera, seen)
+        if factor < _TILT_FACTOR:
+            logger.warning(
+                "camera %s: the board clip hardly tells how the board is tilted (the other tilt "
+                "fits %.1f times worse); use a larger board or bring it nearer",
+                camera.name,
+                factor,
+            )
+
+
+def _other_tilt(boards: Sequence[NamedBoard], camera: Camera, seen: Observations) -> float:
+    """Return how many times worse the other pose of the clip's board fits that tells it best."""
+    factors = []
+    for sighting in seen.sightings:
+        if sighting.instant is None:
+            continue
+        located = locate_board(camera, boards[sighting.board].points_board, sighting.pixels)
+        if located is not None:
+            factors.append(min(located[2] / max(located[1], 1e-9), 1e6))
+    return max(factors, default=1.0)
+
+
+def _without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
+    """Return a bundle without the points that miss by far, and these, the worst first."""
+    bundle = rough.bundle
+    limits_px = []
+    for index in range(len(bundle.cameras)):
+        missed = np.concatenate(
+            [
+                residuals[is_seen(residuals)]
+                for view, residuals in zip(bundle.views, rough.residuals_px, strict=True)
+                if view.camera == index
+            ]
+            or [np.zeros((0, 2))]
+        )
+        # 1.4826 times the median absolute value is the standard deviation of a normal error.
+        sigma_px = 1.4826 * float(np.median(np.abs(missed))) if len(missed) else 0.0
+        limits_px.append(max(_OUTLIER_SIGMAS * sigma_px, _OUTLIER_PX))
+    views: list[BundleView] = []
+    outliers: list[dict[str, Any]] = []
+    for view, residuals in zip(bundle.views, rough.residuals_px, strict=True):
+        misses_px = np.linalg.norm(residuals, axis=1)
+        with np.errstate(invalid="ignore"):
+            is_outlier = misses_px > limits_px[view.camera]
+        if is_outlier.sum() > len(residuals) / 4:
+            is_outlier[:] = False  # a whole view is judged by its lens and by the other views
+        outliers += [
+            {
+                "camera": bundle.cameras[view.camera].name,
+                "image": view.image,
+                "board": view.board,
+                "point": int(point),
+                "missed_px": round(float(misses_px[point]), 2),
+            }
+            for point in np.flatnonzero(is_outlier)
+        ]
+        pixels = np.where(is_outlier[:, None], np.nan, view.pixels)
+        views.append(replace(view, pixels=pixels))
+    outliers.sort(key=lambda told: -told["missed_px"])
+    return replace(bundle, views=tuple(views)), outliers
+
+
+# --- Moving cameras ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mounted:
+    """A moving camera on its tracker."""
+
+    camera: Camera
+    mount: Mount
+    told: dict[str, Any]
+
+
+def _mount(
+    boards: Sequence[NamedBoard],
+    seen: Observations,
+    lens: FittedLens,
+    track: Mapping[int, Pose],
+    solved: "_Solved | None",
+) -> _Mounted:
+    world_from_board = None if solved is None else _still_boards(boards, seen, solved)
+    mount, told = mount_camera(lens.camera, boards, seen.sightings, track, world_from_board)
+    return _Mounted(lens.camera, mount, told)
+
+
+def _still_boards(
+    boards: Sequence[NamedBoard], seen: Observations, solved: "_Solved"
+) -> dict[int, Pose]:
+    """Return where the boards lie that were still in the clip of the fixed cameras."""
+    bundle = solved.adjusted.bundle
+    found: dict[int, Pose] = {}
+    for view in bundle.views:
+        instants = {
+            name[0]
+            for index, name in enumerate(solved.linked.pose_names)
+            if isinstance(name[0], int) and name[1] == solved.linked.pose_names[view.pose][1]
+        }
+        if isinstance(solved.linked.pose_names[view.pose][0], int) and len(instants) == 1:
+            rig_from_board = compose(
+                bundle.rig_from_body[view.pose], bundle.body_from_board[view.board]
+            )
+            found[view.board] = compose(solved.world_from_rig, rig_from_board)
+    if not found:
+        raise CalibrationError(
+            f"camera {seen.name!r} moves: the board must lie still in the clips of all cameras, "
+            "so that its place is known; record such a clip"
+        )
+    return found
+
+
+# --- What is told -----------------------------------------------------------------------------
+
+
+def _put_together(
+    boards: Sequence[NamedBoard],
     observations: Sequence[Observations],
     lenses: Sequence[FittedLens],
-    labelling: dict[str, Any],
+    solved: _Solved | None,
+    mounted: Sequence[_Mounted],
+    about: dict[str, Any],
     settings: CalibrationSettings,
-    views: Sequence[BoardView],
-    n_common: int,
-    result: Adjustment,
-    placed: Sequence[Camera],
-) -> dict[str, Any]:
-    """Return where the rig comes from, as plain JSON values."""
-
-    def errors(indices: list[int]) -> dict[str, Any]:
-        if not indices:
-            return {"views_used": 0, "rms_px": None, "max_px": None}
-        residuals = np.concatenate([result.residuals_px[index] for index in indices])
-        worst = float(np.linalg.norm(residuals, axis=1).max())
-        return {
-            "views_used": len(indices),
-            "rms_px": round(rms(residuals), 4),
-            "max_px": round(worst, 3),
-        }
-
-    cameras: dict[str, dict[str, Any]] = {}
-    for index, (seen, lens, camera) in enumerate(zip(observations, lenses, placed, strict=True)):
-        own = [i for i, view in enumerate(views) if view.camera == index and i >= n_common]
-        common = [i for i, view in enumerate(views) if view.camera == index and i < n_common]
-        clip = seen.clip
-        extrinsics = {
-            "source": seen.sources.get("extrinsics"),
-            "corners_by_hand": seen.sources.get("corners"),
-            **errors(common),
-            "how": clip.how,
-        }
-        if clip.spread_px is not None and np.isfinite(clip.spread_px):
-            extrinsics["spread_over_clip_px"] = round(clip.spread_px, 4)
-        if clip.is_still:
-            tilt = _clip_pose(board, camera, clip)[1]
-            extrinsics["other_tilt_times_worse"] = round(min(tilt, 1e6), 2)
-            if tilt < _TILT_FACTOR:
-                logger.warning(
-                    "camera %s: the board clip hardly tells how the board is tilted (the other "
-                    "tilt fits %.1f times worse); use a larger board or bring it nearer",
-                    camera.name,
-                    tilt,
-                )
-        cameras[seen.name] = {
-            "model": seen.model,
-            "center_m": [round(float(value), 4) for value in camera.center_world],
-            "intrinsics": {
-                "source": seen.sources.get("intrinsics"),
-                **errors(own),
-                "views_dropped": lens.dropped,
-                "views_without_board": seen.stills.missed,
-            },
-            "extrinsics": extrinsics,
-        }
-    is_still = all(seen.clip.is_still for seen in observations)
-    return {
-        "method": "chessboard; joint bundle adjustment of lenses, poses and boards (pycolmap)",
+) -> Calibration:
+    cameras = (() if solved is None else solved.cameras) + tuple(one.camera for one in mounted)
+    pixels: dict[str, NDArray[np.float64]] = {}
+    residuals: dict[str, NDArray[np.float64]] = {}
+    views: Sequence[tuple[BundleView, NDArray[np.float64]]] = ()
+    if solved is not None:
+        views = list(zip(solved.adjusted.bundle.views, solved.adjusted.residuals_px, strict=True))
+    told = {}
+    for index, (seen, lens) in enumerate(zip(observations, lenses, strict=True)):
+        own = [(view, missed) for view, missed in views if view.camera == index]
+        clip = [
+            missed
+            for view, missed in own
+            if solved is not None and isinstance(solved.linked.pose_names[view.pose][0], int)
+        ]
+        alone = [
+            missed
+            for view, missed in own
+            if solved is not None and isinstance(solved.linked.pose_names[view.pose][0], str)
+        ]
+        if own:
+            every = np.concatenate([missed for _, missed in own])
+            found = is_seen(every)
+            residuals[seen.name] = every[found]
+            pixels[seen.name] = np.concatenate([view.pixels for view, _ in own])[found]
+        told[seen.name] = _told_of_camera(boards, seen, lens, alone, clip)
+    for one in mounted:
+        told[one.camera.name]["mount"] = one.told
+    noise = (
+        solved.noise
+        if solved is not None
+        else Noise(lenses[0].noise_px, lenses[0].noise_px, lenses[0].rms_px, 1.0, 0, 0)
+    )
+    provenance: dict[str, Any] = {
+        "method": "joint bundle adjustment of lenses, poses and boards",
         "software": {
             name: importlib.metadata.version(name)
-            for name in ("pycolmap", "opencv-python-headless")
+            for name in ("hybridve", "pycolmap", "opencv-python-headless")
         },
-        "board": asdict(board),
-        "world": "the board as it lies in the clip"
-        if is_still
-        else "the board in the first frame that most cameras see",
-        "rms_px": round(rms(np.concatenate(result.residuals_px)), 4),
-        "cameras": cameras,
-        "labelling": labelling,
-        "settings": asdict(settings),
+        "boards": [{"name": board.name, "body": board.body, "is": str(board)} for board in boards],
+        "rms_px": round(noise.rms_px, 4),
+        "noise": asdict(noise),
+        "cameras": told,
+        **about,
+        "settings": {"lens": asdict(settings.lens), "observe": asdict(settings.observe)},
+    }
+    if solved is not None:
+        provenance["adjustment"] = {
+            "steps": solved.adjusted.n_steps,
+            "views": len(views),
+            "outliers": len(solved.outliers),
+            "worst_outliers": solved.outliers[:_TOLD_OUTLIERS],
+            "left_out": dict(solved.linked.left_out),
+            "warnings": list(solved.linked.warnings),
+        }
+    rig = Rig(
+        cameras,
+        provenance,
+        covariance=_whole_covariance(solved, mounted),
+        mounts={one.camera.name: one.mount for one in mounted},
+    )
+    return Calibration(rig, noise, pixels, residuals)
+
+
+def _whole_covariance(solved: _Solved | None, mounted: Sequence[_Mounted]) -> RigCovariance:
+    """Return the covariance of all cameras; moving ones are independent, their lenses as given.
+
+    The pose of a moving camera is that at one instant.
+    """
+    labels = () if solved is None else solved.covariance.labels
+    blocks = [] if solved is None else [solved.covariance.matrix]
+    for one in mounted:
+        names = camera_parameter_names(one.camera)
+        labels += tuple(f"{one.camera.name} {name}" for name in names)
+        block = np.zeros((len(names), len(names)))
+        block[:POSE, :POSE] = one.told["pose_covariance"]
+        blocks.append((block + block.T) / 2.0)
+    size = sum(map(len, blocks))
+    matrix = np.zeros((size, size))
+    position = 0
+    for block in blocks:
+        span = slice(position, position + len(block))
+        matrix[span, span] = block
+        position += len(block)
+    return RigCovariance(labels, matrix)
+
+
+def _told_of_camera(
+    boards: Sequence[NamedBoard],
+    seen: Observations,
+    lens: FittedLens,
+    stills: Sequence[NDArray[np.float64]],
+    clip: Sequence[NDArray[np.float64]],
+) -> dict[str, Any]:
+    """Return where one camera's numbers come from, as plain JSON values."""
+    extrinsics = {
+        "source": seen.sources.get("extrinsics"),
+        "corners_by_hand": seen.sources.get("corners"),
+        **_errors(clip),
+        "how": seen.how,
+    }
+    if seen.spread_px is not None and np.isfinite(seen.spread_px):
+        extrinsics["spread_over_clip_px"] = round(seen.spread_px, 4)
+    if seen.is_still:
+        extrinsics["other_tilt_times_worse"] = round(_other_tilt(boards, lens.camera, seen), 2)
+    told: dict[str, Any] = {
+        "model": lens.camera.model,
+        "intrinsics": {
+            "source": seen.sources.get("intrinsics"),
+            **_errors(stills),
+            "views_dropped": lens.dropped,
+            "views_without_board": seen.missed,
+            "outliers": len(lens.outliers),
+        },
+        "extrinsics": extrinsics,
+        "warnings": list(lens.warnings),
+        "notes": list(seen.notes),
+    }
+    if lens.choice is not None:
+        told["model_chosen"] = lens.choice
+    return told
+
+
+def _errors(residuals: Sequence[NDArray[np.float64]]) -> dict[str, Any]:
+    if not residuals:
+        return {"views_used": 0, "rms_px": None, "max_px": None}
+    every = np.concatenate(residuals)
+    every = every[is_seen(every)]
+    return {
+        "views_used": len(residuals),
+        "rms_px": round(rms(every), 4),
+        "max_px": round(float(np.linalg.norm(every, axis=1).max()), 3),
     }

@@ -151,15 +151,18 @@ def rig_covariance(adjusted: Adjusted, sigma_px: float) -> RigCovariance:
             columns += [None] * len(camera.params)
         else:
             columns += range(lens_span.start, lens_span.stop)
-        labels += [
-            f"{camera.name} {what}" for what in (*_POSE_NAMES, *parameter_names(camera.model))
-        ]
+        labels += [f"{camera.name} {what}" for what in camera_parameter_names(camera)]
     taken = np.array([0 if column is None else column for column in columns])
     matrix = inverse[np.ix_(taken, taken)]
     given = np.array([column is None for column in columns])
     matrix[given] = 0.0
     matrix[:, given] = 0.0
     return RigCovariance(tuple(labels), (matrix + matrix.T) / 2.0)
+
+
+def camera_parameter_names(camera: Camera) -> tuple[str, ...]:
+    """Return the names of a camera's parameters: pose first, lens in COLMAP's order."""
+    return (*_POSE_NAMES, *parameter_names(camera.model))
 
 
 def _prior_of_lens(camera: Camera) -> NDArray[np.float64]:

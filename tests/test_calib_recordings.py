@@ -9,17 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridve.calib.calibrate import (
-    CalibrationSettings,
-    CameraInput,
-    calibrate_rig,
-    find_board,
-    observe_board,
-    solve_rig,
-)
+from hybridve.calib.board import Sighting
+from hybridve.calib.calibrate import CalibrationSettings, calibrate_rig, solve_rig
 from hybridve.calib.check import check_rig
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import open_source
+from hybridve.calib.observe import CameraInput, ObserveSettings, find_boards, observe_boards
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import import_rig
 from hybridve.calib.target import Chessboard
@@ -35,7 +30,8 @@ HORSEMAN_MM = (2565.0, 6268.0, 5337.0, 4473.0, 2812.5, 3056.0)
 HORSEMAN_RELATIVE = 0.02
 
 #: Half of the stills: the tests stay quick, and the claim holds with less.
-SETTINGS = CalibrationSettings(max_stills=25, enough_stills=12, threads=2)
+OBSERVE = ObserveSettings(max_stills=25, enough_stills=12, threads=2)
+SETTINGS = CalibrationSettings(observe=OBSERVE)
 
 #: What was published for the pair, from corners that miss by 0.45 px; ours miss by 0.18 px.
 STEREO_BASELINE = 3.344
@@ -69,14 +65,14 @@ def horseman_inputs(recordings: Path) -> Callable[[bool], list[CameraInput]]:
 @pytest.fixture(scope="session")
 def horseman(horseman_inputs: Callable[[bool], list[CameraInput]]) -> Rig:
     """The rig without any corner marked by hand."""
-    return calibrate_rig(HORSEMAN, horseman_inputs(False), SETTINGS)
+    return calibrate_rig([HORSEMAN], horseman_inputs(False), SETTINGS).rig
 
 
 @pytest.fixture(scope="session")
 def board_corners(
     horseman_inputs: Callable[[bool], list[CameraInput]],
-) -> dict[str, NDArray[np.float64]]:
-    return find_board(HORSEMAN, horseman_inputs(False), SETTINGS)
+) -> dict[str, tuple[Sighting, ...]]:
+    return find_boards([HORSEMAN], horseman_inputs(False), OBSERVE)
 
 
 def test_horseman_cameras_stand_where_two_calibrations_have_them(horseman: Rig) -> None:
@@ -119,13 +115,13 @@ def test_marks_set_the_world_that_their_reference_has(
     )
 
     marked = solve_rig(
-        HORSEMAN,
-        observe_board(
-            HORSEMAN,
+        [HORSEMAN],
+        observe_boards(
+            [HORSEMAN],
             horseman_inputs(True),
-            CalibrationSettings(max_stills=10, enough_stills=0, threads=2),
+            ObserveSettings(max_stills=10, enough_stills=0, threads=2),
         ),
-    )
+    ).rig
 
     for camera in reference.cameras:
         off_m = np.linalg.norm(marked[camera.name].center_world - camera.center_world)
@@ -139,7 +135,7 @@ def test_marks_set_the_world_that_their_reference_has(
     ("name", "unit"), [("reference_a_squares", "squares"), ("reference_b_mm", "mm")]
 )
 def test_both_references_agree_with_the_board_clip(
-    recordings: Path, board_corners: dict[str, NDArray[np.float64]], name: str, unit: str
+    recordings: Path, board_corners: dict[str, tuple[Sighting, ...]], name: str, unit: str
 ) -> None:
     rig = import_rig(
         recordings / "horseman",
@@ -150,14 +146,14 @@ def test_both_references_agree_with_the_board_clip(
         0.115,
     )
 
-    check = check_rig(rig, HORSEMAN, board_corners)
+    check = check_rig(rig, [HORSEMAN], board_corners)
 
     assert check.is_trustworthy, check.message
     assert check.scale == pytest.approx(1.0, abs=0.01)
 
 
 def test_the_third_calibration_is_refused_with_the_scale_it_has(
-    recordings: Path, board_corners: dict[str, NDArray[np.float64]]
+    recordings: Path, board_corners: dict[str, tuple[Sighting, ...]]
 ) -> None:
     rig = import_rig(
         recordings / "horseman",
@@ -168,7 +164,7 @@ def test_the_third_calibration_is_refused_with_the_scale_it_has(
         0.115,
     )
 
-    check = check_rig(rig, HORSEMAN, board_corners)
+    check = check_rig(rig, [HORSEMAN], board_corners)
 
     assert not check.is_trustworthy
     assert 1.2 < check.scale < 1.35  # its distances are 20 to 31 % too large
@@ -176,9 +172,9 @@ def test_the_third_calibration_is_refused_with_the_scale_it_has(
 
 
 def test_our_own_rig_agrees_with_the_board_clip(
-    horseman: Rig, board_corners: dict[str, NDArray[np.float64]]
+    horseman: Rig, board_corners: dict[str, tuple[Sighting, ...]]
 ) -> None:
-    check = check_rig(horseman, HORSEMAN, board_corners)
+    check = check_rig(horseman, [HORSEMAN], board_corners)
 
     assert check.is_trustworthy
     assert check.scale == pytest.approx(1.0, abs=0.002)
@@ -189,7 +185,7 @@ def test_a_camera_of_the_wrong_board_is_named(
     horseman_inputs: Callable[[bool], list[CameraInput]],
 ) -> None:
     with pytest.raises(CalibrationError, match=r"'cam2': no board of 9x6 .*tried classic"):
-        observe_board(Chessboard(9, 6, 0.115), horseman_inputs(False)[1:2], SETTINGS)
+        observe_boards([Chessboard(9, 6, 0.115)], horseman_inputs(False)[1:2], OBSERVE)
 
 
 def test_child_rope_matrices_are_taken_by_folder(recordings: Path) -> None:
@@ -238,7 +234,7 @@ def test_a_stereo_pair_of_moving_boards_has_its_published_baseline(recordings: P
         for name in ("left", "right")
     ]
 
-    rig = calibrate_rig(Chessboard(9, 6, 1.0), cameras, SETTINGS)
+    rig = calibrate_rig([Chessboard(9, 6, 1.0)], cameras, SETTINGS).rig
 
     baseline = np.linalg.norm(rig["left"].center_world - rig["right"].center_world)
     assert baseline == pytest.approx(STEREO_BASELINE, rel=STEREO_RELATIVE)

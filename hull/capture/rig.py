@@ -6,43 +6,86 @@ import logging
 from collections.abc import Callable
 from dataclasses import asdict
 
-from hybridve.calib.calibrate import CameraInput, calibrate_rig, find_board
-from hybridve.calib.check import check_rig
+import numpy as np
+
+from hybridve.calib.boards import make_board
+from hybridve.calib.calibrate import Calibration, CalibrationSettings, calibrate_rig
+from hybridve.calib.check import RigCheck, check_rig
+from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.link import NamedBoard
+from hybridve.calib.observe import CameraInput, find_boards
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict
-from hybridve.calib.target import Chessboard
+from hybridve.calib.tracker_io import read_poses
+from hybridve.calib.world import Mark
 from hybridve.hull.capture.recording import recording_of
-from hybridve.hull.capture.session import ChessboardTable, RigFile, Session
+from hybridve.hull.capture.session import RigFile, Session
 
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 
 
-def calibrate_session(session: Session, progress: Progress | None = None) -> Rig:
-    """Return a session's rig from its pictures of the board, or the rig it names, tested.
+def calibrate_session(session: Session, progress: Progress | None = None) -> Calibration:
+    """Return a session's rig from its pictures of its boards, and what it was made from.
+
+    What was found in the pictures is kept beside the session (rig/corners), so that they are
+    searched once.
 
     Raises
     ------
     CalibrationError
-        If the session says too little, the board cannot be found, or a rig made elsewhere does not
-        fit the board that the session's cameras saw.
+        If the session says too little, no board can be found, or the cameras cannot be linked.
     """
-    if session.rig_file is not None:
-        return _take_elsewhere(session, session.rig_file, progress)
-    if session.target is None:
-        raise CalibrationError(
-            f"{session.path}: has neither a [target] to calibrate with nor a rig made elsewhere; "
-            "describe the board, or name a rig with rig ="
-        )
+    boards = session_boards(session)
     for number, camera in enumerate(session.cameras, start=1):
         if camera.extrinsics is None:
             raise CalibrationError(
                 f"{session.path}: camera.{number} ({camera.name!r}) has no extrinsics; name the "
                 "recording in which all cameras see the board at once"
             )
-    return calibrate_rig(_board(session), _inputs(session), progress=progress)
+    settings = CalibrationSettings(
+        world=session.world,
+        marks=tuple(
+            Mark(
+                point.name,
+                point.pixels,
+                None if point.xyz_mm is None else np.array(point.xyz_mm) / 1000.0,
+                point.floor,
+            )
+            for point in session.points
+        ),
+        sync=session.sync,
+    )
+    tracks = {
+        camera.name: read_poses(camera.extrinsics_poses)
+        for camera in session.cameras
+        if camera.extrinsics_poses is not None
+    }
+    return calibrate_rig(
+        boards, _inputs(session), settings, progress, _corner_cache(session), tracks
+    )
+
+
+def session_boards(session: Session) -> list[NamedBoard]:
+    """Return the boards that a session describes.
+
+    Raises
+    ------
+    CalibrationError
+        If it describes none, or one that cannot be.
+    """
+    if not session.targets:
+        raise CalibrationError(
+            f"{session.path}: has neither a [target] to calibrate with nor a rig made elsewhere; "
+            "describe the board, or name a rig with rig ="
+        )
+    return [make_board(target.table()) for target in session.targets]
+
+
+def _corner_cache(session: Session) -> CornerCache:
+    return CornerCache(session.folder / "rig" / "corners")
 
 
 def has_rig(session: Session) -> bool:
@@ -86,21 +129,45 @@ def rig_digest(rig: Rig) -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
-def _take_elsewhere(session: Session, rig_file: RigFile, progress: Progress | None) -> Rig:
-    rig = _import(session, rig_file, _calibrated_sizes(session))
+def take_elsewhere(session: Session, progress: Progress | None = None) -> Rig:
+    """Return the rig that a session names, tested against its boards if it has any.
+
+    Raises
+    ------
+    CalibrationError
+        If the rig cannot be read, or does not fit the boards that the session's cameras saw.
+    """
+    assert session.rig_file is not None
+    rig = _import(session, session.rig_file, _calibrated_sizes(session))
     seeing = [camera for camera in session.cameras if camera.extrinsics is not None]
     if session.target is None or len(seeing) < 2:
         _log.warning(
             "%s: the rig %r is taken as it is: there is no board in the session to test it against",
             session.path,
-            rig_file.pattern,
+            session.rig_file.pattern,
         )
         return rig
-    corners = find_board(_board(session), _inputs(session), progress=progress)
-    check = check_rig(rig, _board(session), corners)
+    check = check_session(session, rig, progress)
     if not check.is_trustworthy:
-        raise CalibrationError(f"{session.path}: rig {rig_file.pattern!r}: {check.message}")
-    return Rig(rig.cameras, {**rig.provenance, "check": asdict(check)})
+        raise CalibrationError(
+            f"{session.path}: rig {session.rig_file.pattern!r}: {check.message}"
+        )
+    return Rig(rig.cameras, {**rig.provenance, "check": asdict(check)}, rig.covariance, rig.mounts)
+
+
+def check_session(session: Session, rig: Rig, progress: Progress | None = None) -> RigCheck:
+    """Test a rig against the boards that a session's cameras saw at once.
+
+    Raises
+    ------
+    CalibrationError
+        If no board can be found, or fewer than two cameras of the rig see one.
+    """
+    boards = session_boards(session)
+    sightings = find_boards(
+        boards, _inputs(session), progress=progress, cache=_corner_cache(session)
+    )
+    return check_rig(rig, boards, sightings)
 
 
 def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, int]]) -> Rig:
@@ -139,15 +206,16 @@ def _calibrated_sizes(session: Session) -> dict[str, tuple[int, int]]:
     return sizes_px
 
 
-def _board(session: Session) -> Chessboard:
-    target = session.target
-    if not isinstance(target, ChessboardTable):
-        raise CalibrationError(f"{session.path}: has no [target] of kind chessboard")
-    return Chessboard(target.columns, target.rows, target.sides_mm[0] / 1000.0)
-
-
 def _inputs(session: Session) -> list[CameraInput]:
     return [
-        CameraInput(camera.name, camera.model, camera.intrinsics, camera.extrinsics, camera.corners)
+        CameraInput(
+            camera.name,
+            camera.model,
+            camera.intrinsics,
+            camera.extrinsics,
+            camera.corners,
+            camera.lens,
+            camera.params,
+        )
         for camera in session.cameras
     ]

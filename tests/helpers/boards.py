@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.calibrate import Clip, Observations, Stills
+from hybridve.calib.board import Observations, Sighting
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, img_from_cam
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes, transform
@@ -111,14 +111,14 @@ def observe_exactly(
 
     observations = []
     for index, camera in enumerate(cameras):
-        stills = {
-            f"{number}.png": seen(camera, pose)
+        stills = [
+            Sighting(f"{number}.png", None, 0, seen(camera, pose))
             for number, pose in enumerate(board_poses(board, n_stills, index))
-        }
+        ]
+        clip = Sighting("board clip", 0, 0, seen(camera, camera.cam_from_world))
         size_px = (camera.width_px, camera.height_px)
-        clip = Clip(size_px, {0: seen(camera, camera.cam_from_world)}, True)
         observations.append(
-            Observations(camera.name, camera.model, Stills(size_px, stills, {}), clip)
+            Observations(camera.name, camera.model, size_px, (*stills, clip), is_still=True)
         )
     return observations
 
