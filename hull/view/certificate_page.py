@@ -463,7 +463,7 @@ def _details(details: Mapping[str, Any]) -> str:
     if not details:
         return ""
     parts = [
-        f"<details><summary>{escape(str(key))}{_count(value)}</summary>{_render(value)}</details>"
+        f"<details><summary>{escape(str(key))}{_count(value)}</summary>{render(value)}</details>"
         for key, value in details.items()
     ]
     return "<h2>How it came about</h2>\n" + "\n".join(parts)
@@ -478,7 +478,7 @@ def _count(value: Any) -> str:
     return ""
 
 
-def _render(value: Any) -> str:
+def render(value: Any) -> str:
     """Return any plain value as HTML: mappings as tables, long ones and lists folded."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
@@ -511,15 +511,15 @@ def _render_mapping(value: Mapping[Any, Any]) -> str:
 def _fold(value: Any) -> str:
     """Return a value, folded if it is long."""
     if isinstance(value, Mapping) and len(value) > _MOST_SHOWN:
-        return f"<details><summary>{len(value)} entries</summary>{_render(value)}</details>"
-    return _render(value)
+        return f"<details><summary>{len(value)} entries</summary>{render(value)}</details>"
+    return render(value)
 
 
 def _render_list(value: Sequence[Any]) -> str:
     if not value:
         return '<span class="none">none</span>'
     if all(_is_flat(entry) for entry in value):
-        texts = [_render(entry) for entry in value]
+        texts = [render(entry) for entry in value]
         whole = (
             ", ".join(texts)
             if max(map(len, texts)) <= 40
