@@ -41,6 +41,16 @@ class Board(Protocol):
     """A flat calibration target."""
 
     @property
+    def name(self) -> str:
+        """Its name, unique among the boards of a session."""
+        ...
+
+    @property
+    def body(self) -> str | None:
+        """The rigid body that it is mounted on, maybe with others; None: it moves alone."""
+        ...
+
+    @property
     def points_board(self) -> NDArray[np.float64]:
         """Its points: (N, 3) metres, z = 0."""
         ...

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations, is_seen
+from hybridve.calib.board import Board, Observations, is_seen
 from hybridve.calib.bundle import POSE, Adjusted, Bundle, BundleView, adjust
 from hybridve.calib.camera import Camera
 from hybridve.calib.clock import estimate_offsets, resampled
@@ -32,7 +32,7 @@ from hybridve.calib.image_io import natural_order
 from hybridve.calib.labelling import label_still_boards
 from hybridve.calib.lens_choice import choose_shared_lens
 from hybridve.calib.lens_fit import FittedLens, LensSettings, fit_shared_lens, locate_board, rms
-from hybridve.calib.link import Linked, NamedBoard, link_cameras
+from hybridve.calib.link import Linked, link_cameras
 from hybridve.calib.observe import CameraInput, ObserveSettings, observe_boards
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.rig import Mount, Rig, RigCovariance
@@ -133,7 +133,7 @@ class Calibration:
 
 
 def calibrate_rig(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     cameras: Sequence[CameraInput],
     settings: CalibrationSettings = _DEFAULTS,
     progress: Progress | None = None,
@@ -144,7 +144,7 @@ def calibrate_rig(
 
     Parameters
     ----------
-    boards : sequence of NamedBoard
+    boards : sequence of Board
         The boards in all pictures.
     cameras : sequence of CameraInput
         The cameras; their order does not matter.
@@ -189,7 +189,7 @@ def calibrate_rig(
 
 
 def solve_rig(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     observations: Sequence[Observations],
     settings: CalibrationSettings = _DEFAULTS,
     progress: Progress | None = None,
@@ -229,7 +229,7 @@ def _no_progress(what: str, done: int, total: int) -> None:
 
 
 def _fit_lenses(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     observations: Sequence[Observations],
     settings: LensSettings,
     requests: Mapping[str, LensRequest],
@@ -264,7 +264,7 @@ def _known_params(
 
 
 def _synchronised(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     observations: Sequence[Observations],
     settings: CalibrationSettings,
     requests: Mapping[str, LensRequest],
@@ -312,7 +312,7 @@ class _Solved:
 
 
 def _solve_fixed(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     observations: Sequence[Observations],
     lenses: Sequence[FittedLens],
     requests: Mapping[str, LensRequest],
@@ -360,14 +360,14 @@ def _solve_fixed(
     )
 
 
-def _seen_boards(boards: Sequence[NamedBoard], linked: Linked, bundle: Bundle) -> SeenBoards:
+def _seen_boards(boards: Sequence[Board], linked: Linked, bundle: Bundle) -> SeenBoards:
     return SeenBoards(
         boards, bundle.body_from_board, bundle.rig_from_body, linked.pose_names, bundle.views
     )
 
 
 def _make_bundle(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     lenses: Sequence[FittedLens],
     linked: Linked,
     requests: Mapping[str, LensRequest],
@@ -429,7 +429,7 @@ def _refuse_wrong_clips(rough: Adjusted, linked: Linked) -> None:
 
 
 def _warn_of_flat_views(
-    boards: Sequence[NamedBoard], cameras: Sequence[Camera], observations: Sequence[Observations]
+    boards: Sequence[Board], cameras: Sequence[Camera], observations: Sequence[Observations]
 ) -> None:
     """Warn where a still board hardly tells how it is tilted."""
     for camera, seen in zip(cameras, observations, strict=True):
@@ -443,7 +443,7 @@ def _warn_of_flat_views(
             )
 
 
-def _other_tilt(boards: Sequence[NamedBoard], camera: Camera, seen: Observations) -> float:
+def _other_tilt(boards: Sequence[Board], camera: Camera, seen: Observations) -> float:
     """Return how many times worse the other pose of the clip's board fits that tells it best."""
     factors = []
     for sighting in seen.sightings:
@@ -508,7 +508,7 @@ class _Mounted:
 
 
 def _mount(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     seen: Observations,
     lens: FittedLens,
     track: Mapping[int, Pose],
@@ -520,7 +520,7 @@ def _mount(
 
 
 def _still_boards(
-    boards: Sequence[NamedBoard], seen: Observations, solved: "_Solved"
+    boards: Sequence[Board], seen: Observations, solved: "_Solved"
 ) -> dict[int, Pose]:
     """Return where the boards lie that were still in the clip of the fixed cameras."""
     bundle = solved.adjusted.bundle
@@ -548,7 +548,7 @@ def _still_boards(
 
 
 def _put_together(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     observations: Sequence[Observations],
     lenses: Sequence[FittedLens],
     solved: _Solved | None,
@@ -643,7 +643,7 @@ def _whole_covariance(solved: _Solved | None, mounted: Sequence[_Mounted]) -> Ri
 
 
 def _told_of_camera(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     seen: Observations,
     lens: FittedLens,
     stills: Sequence[NDArray[np.float64]],

@@ -1,7 +1,9 @@
-"""``hybridve calibrate``: from pictures of a board to a rig."""
+"""``hybridve calibrate``: from pictures of boards to a rig, and to a verdict on it."""
 
 import json
 import math
+import sys
+from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +14,52 @@ from hybridve.cli import options
 from hybridve.cli.progress import StageProgress
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridve.calib.calibrate import Calibration
+    from hybridve.calib.certificate import Certificate, SeenPoints, Volume
+    from hybridve.calib.check import RigCheck
     from hybridve.calib.rig import Rig
+    from hybridve.hull.capture.session import Session
+
+    Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+#: Exit status where the rig is not as good as --max-error-mm asks, or --check finds it wrong.
+NOT_GOOD_ENOUGH = 4
 
 
-@click.command(short_help="Find where the cameras stand, from pictures of a board.")
+class BoxMillimetres(click.ParamType["Box"]):
+    """Two corners of a box, in millimetres."""
+
+    name = "X,Y,Z:X,Y,Z"
+
+    def convert(
+        self, value: str, param: click.Parameter | None, ctx: click.Context | None
+    ) -> "Box":
+        """Return the lowest and the highest corner in metres, or fail with what was expected."""
+        import numpy as np
+
+        if not isinstance(value, str):
+            return value
+        try:
+            low, high = (
+                np.array([float(part) for part in corner.split(",")]) / 1000.0
+                for corner in value.split(":")
+            )
+        except ValueError:
+            low = high = np.zeros(0)
+        if low.shape != (3,) or high.shape != (3,) or not (low < high).all():
+            self.fail(
+                f"{value!r} is not a box; expected its lowest and its highest corner in mm, as "
+                "-500,-500,0:500,500,1500",
+                param,
+                ctx,
+            )
+        return low, high
+
+
+@click.command(short_help="Find where the cameras stand, from pictures of boards, and how surely.")
 @options.session_arg
 @click.option(
     "-o",
@@ -23,47 +67,224 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="The folder to write the rig into. Default: rig/ beside the session.toml.",
 )
+@click.option(
+    "--max-error-mm",
+    type=click.FloatRange(min=0, min_open=True),
+    help=f"Leave with exit status {NOT_GOOD_ENOUGH} if points in the working volume may be off by "
+    "more than this (95 %).",
+)
+@click.option(
+    "--volume-mm",
+    "box_world",
+    type=BoxMillimetres(),
+    help="The working volume in the rig's world. Default: what all cameras see about the point "
+    "that they look at, above the floor.",
+)
+@click.option(
+    "--check",
+    "checked",
+    type=click.Path(path_type=Path),
+    metavar="RIG",
+    help="Calibrate nothing: test this rig, of any format, against the boards of SESSION, and name "
+    f"the camera that is wrong. Exit status {NOT_GOOD_ENOUGH} if it does not fit.",
+)
+@click.option(
+    "--rig-unit",
+    type=click.Choice(["m", "cm", "mm", "in", "ft"]),
+    help="Unit of RIG's lengths, where its format has none.",
+)
+@click.option("--no-page", is_flag=True, help="Write no certificate.html, which takes seconds.")
 @options.overwrite_option
 @options.json_option
 @options.quiet_progress
 def calibrate(
-    session: Path, output: Path | None, overwrite: bool, as_json: bool, progress: bool
+    session: Path,
+    output: Path | None,
+    max_error_mm: float | None,
+    box_world: "Box | None",
+    checked: Path | None,
+    rig_unit: str | None,
+    no_page: bool,
+    overwrite: bool,
+    as_json: bool,
+    progress: bool,
 ) -> None:
     r"""Find lenses and places of SESSION's cameras from its pictures of the target.
 
-    Writes rig.json and a COLMAP model. A rig that the session names (rig = ...) is taken instead,
-    and tested against the session's board, if there is one.
+    Writes rig.json (with its covariance), a COLMAP model, and the certificate: how far points in
+    the working volume may be off, what limits that and what to record, as certificate.json and as
+    a page with pictures, certificate.html. What was found in pictures is kept in rig/corners and
+    not searched again.
+
+    A rig that the session names (rig = ...) is taken instead, and tested against the session's
+    boards, if there are any.
 
     \b
     Example:
-      hybridve calibrate data/horseman
+      hybridve calibrate data/horseman --max-error-mm 10
+      hybridve calibrate --check yesterday/rig/rig.json today
     """
-    from hybridve.calib.colmap_io import write_colmap_model
-    from hybridve.calib.rig_io import write_rig
-    from hybridve.hull.capture.rig import calibrate_session
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.report.write import refuse_existing
 
     loaded = load_session(session)
-    folder = output or loaded.folder / "rig"
+    stages = StageProgress(enabled=progress)
+    if checked is not None:
+        _check(loaded, checked, rig_unit, stages, as_json=as_json)
+        return
+    if rig_unit is not None:
+        raise click.UsageError("--rig-unit goes with --check")
+    _calibrate(
+        loaded,
+        output or loaded.folder / "rig",
+        stages,
+        box_world=box_world,
+        max_error_m=None if max_error_mm is None else max_error_mm / 1000.0,
+        with_page=not no_page,
+        overwrite=overwrite,
+        as_json=as_json,
+    )
+
+
+# --- A rig that is checked --------------------------------------------------------------------
+
+
+def _check(
+    session: "Session", source: Path, unit: str | None, stages: StageProgress, *, as_json: bool
+) -> None:
+    from hybridve.calib.rig_io import read_any_rig
+    from hybridve.hull.capture.rig import board_sizes, check_session
+
+    names = [camera.name for camera in session.cameras]
+    sizes_px = set(board_sizes(session).values())
+    image_size = sizes_px.pop() if len(sizes_px) == 1 else None
+    rig = read_any_rig(source, unit=unit, image_size=image_size, names=names)
+    check = check_session(session, rig, stages)
+    if as_json:
+        click.echo(json.dumps(_plain({"rig": str(source), **asdict(check)})))
+    else:
+        _print_check(source, check)
+    if not check.is_trustworthy:
+        sys.exit(NOT_GOOD_ENOUGH)
+
+
+def _print_check(source: Path, check: "RigCheck") -> None:
+    click.echo(f"{source}: {check.message}")
+    missed = ", ".join(f"{name} {rms_px:.2f}" for name, rms_px in check.rms_px.items())
+    click.echo(f"  boards are missed by, px rms: {missed}")
+    click.echo(f"  scale: {check.scale:.4f}")
+
+
+def _plain(value: Any) -> Any:
+    """Return plain JSON values: NaN, which JSON does not have, becomes null."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+# --- A rig that is made -----------------------------------------------------------------------
+
+
+def _calibrate(
+    session: "Session",
+    folder: Path,
+    stages: StageProgress,
+    *,
+    box_world: "Box | None",
+    max_error_m: float | None,
+    with_page: bool,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    from hybridve.calib.certificate import SeenPoints, certify, working_volume
+    from hybridve.calib.colmap_io import write_colmap_model
+    from hybridve.calib.rig_io import write_rig
+    from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
+    from hybridve.hull.report.write import refuse_existing
+
     folder.parent.mkdir(parents=True, exist_ok=True)
     folder.mkdir(exist_ok=True)
     path = folder / "rig.json"
     refuse_existing(path, overwrite=overwrite)
-    rig = calibrate_session(loaded, progress=StageProgress(enabled=progress))
+    certificate = None
+    if session.rig_file is not None:
+        rig = take_elsewhere(session, stages)
+    else:
+        calibration = calibrate_session(session, stages)
+        rig = calibration.rig
+        volume = working_volume(rig, box_world)
+        seen = {
+            name: SeenPoints(pixels, calibration.residuals_px[name])
+            for name, pixels in calibration.pixels.items()
+        }
+        certificate = certify(rig, seen, calibration.noise, volume)
+        _write_certificate(
+            folder, session, calibration, certificate, seen, volume, max_error_m, with_page
+        )
     write_colmap_model(folder / "colmap", rig)
     write_rig(path, rig)
-    numbers = _numbers(path, rig)
+    numbers = _numbers(path, rig, certificate)
     if as_json:
-        click.echo(json.dumps(numbers))
+        click.echo(json.dumps(_plain(numbers)))
     else:
-        _print(numbers)
+        _print(numbers, certificate)
+    if max_error_m is not None:
+        _gate(certificate, max_error_m)
 
 
-def _numbers(path: Path, rig: "Rig") -> dict[str, Any]:
+def _write_certificate(
+    folder: Path,
+    session: "Session",
+    calibration: "Calibration",
+    certificate: "Certificate",
+    seen: dict[str, "SeenPoints"],
+    volume: "Volume",
+    max_error_m: float | None,
+    with_page: bool,
+) -> None:
+    text = json.dumps(certificate.to_dict(), indent=1, allow_nan=False) + "\n"
+    partial = folder / "certificate.json.partial"
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(folder / "certificate.json")
+    page = folder / "certificate.html"
+    if not with_page:
+        page.unlink(missing_ok=True)  # one of an older rig would be believed
+        return
+    from hybridve.hull.view.certificate_page import write_certificate_page
+
+    write_certificate_page(
+        page,
+        calibration.rig,
+        certificate,
+        seen,
+        volume,
+        title=session.name,
+        details=calibration.rig.provenance,
+        max_error_m=max_error_m,
+    )
+
+
+def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
+    """Leave with a status of its own if the error is not proved to be small enough."""
+    error_m = math.nan if certificate is None else certificate.error95_m
+    if error_m <= max_error_m:
+        return
+    found = f"{1000 * error_m:.2g} mm" if math.isfinite(error_m) else "an unknown error"
+    click.echo(
+        f"error: the rig is good to {found}, not to {1000 * max_error_m:g} mm as --max-error-mm "
+        "asks; it was written all the same",
+        err=True,
+    )
+    sys.exit(NOT_GOOD_ENOUGH)
+
+
+def _numbers(path: Path, rig: "Rig", certificate: "Certificate | None") -> dict[str, Any]:
     """Return what to tell of a rig, as plain JSON values."""
     centers = rig.centers_world
-    return {
+    numbers: dict[str, Any] = {
         "rig": str(path),
         "cameras": [
             {
@@ -80,17 +301,26 @@ def _numbers(path: Path, rig: "Rig") -> dict[str, Any]:
         },
         **{
             key: rig.provenance[key]
-            for key in ("world", "rms_px", "labelling", "check")
+            for key in ("world", "rms_px", "labelling", "clocks", "adjustment", "check")
             if key in rig.provenance
         },
     }
+    if certificate is not None:
+        numbers["certificate"] = certificate.to_dict()
+    return numbers
 
 
-def _print(numbers: dict[str, Any]) -> None:
+def _print(numbers: dict[str, Any], certificate: "Certificate | None") -> None:
+    if certificate is not None:
+        click.echo(certificate.verdict)
     click.echo(f"{numbers['rig']}: {len(numbers['cameras'])} cameras")
+    told = {} if certificate is None else {one.name: one for one in certificate.cameras}
     for camera in numbers["cameras"]:
         x, y, z = camera["center_m"]
-        parts = [f"  {camera['name']}: {camera['model']}, at ({x:.3f}, {y:.3f}, {z:.3f}) m"]
+        place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) m"
+        if camera["name"] in told:
+            place += f" +- {1000 * told[camera['name']].place_std_m:.2g} mm"
+        parts = [f"  {camera['name']}: {camera['model']}, {place}"]
         for kind, what in (("intrinsics", "stills"), ("extrinsics", "board clip")):
             found = camera.get(kind, {})
             if found.get("rms_px") is not None:
@@ -100,10 +330,25 @@ def _print(numbers: dict[str, Any]) -> None:
         if dropped or without:
             parts.append(f"{len(dropped)} views dropped, {len(without)} without a board")
         click.echo("; ".join(parts))
+        if "model_chosen" in camera:
+            click.echo(f"    {camera['model_chosen']['reason']}")
     pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in numbers["distances_m"].items())
-    click.echo(f"  distances, m: {pairs}")
+    if pairs:
+        click.echo(f"  distances, m: {pairs}")
     if "rms_px" in numbers:
-        click.echo(f"  joint adjustment: {numbers['rms_px']:.3f} px rms over all views")
+        outliers = numbers.get("adjustment", {}).get("outliers", 0)
+        left_out = f", {outliers} outliers left out" if outliers else ""
+        click.echo(f"  joint adjustment: {numbers['rms_px']:.3f} px rms over all views{left_out}")
+    _print_decisions(numbers)
+    if certificate is not None:
+        for warning in certificate.warnings:
+            click.echo(f"  {warning}")
+
+
+def _print_decisions(numbers: dict[str, Any]) -> None:
+    """Tell what was decided on the way: the world, symmetric boards, clocks, a check."""
+    if "world" in numbers:
+        click.echo(f"  the world: {numbers['world']['text']}")
     labelling = numbers.get("labelling", {})
     if "weakest_sigma" in labelling:
         click.echo(
@@ -111,5 +356,15 @@ def _print(numbers: dict[str, Any]) -> None:
             f"{labelling['decided_by']}, by {labelling['weakest_sigma']:.1f} standard deviations "
             f"or more{' (weak: compare a distance you know)' if labelling.get('is_weak') else ''}"
         )
+    if "clocks" in numbers:
+        clocks = numbers["clocks"]
+        late = ", ".join(
+            f"{name} {offset:+.2f} +- {clocks['std_frames'][name]:.2f}"
+            if offset is not None
+            else f"{name} unknown"
+            for name, offset in clocks["offset_frames"].items()
+            if name != clocks["reference"]
+        )
+        click.echo(f"  clocks, frames late against {clocks['reference']}: {late}")
     if "check" in numbers:
         click.echo(f"  {numbers['check']['message']}")

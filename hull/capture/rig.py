@@ -8,12 +8,12 @@ from dataclasses import asdict
 
 import numpy as np
 
+from hybridve.calib.board import Board
 from hybridve.calib.boards import make_board
 from hybridve.calib.calibrate import Calibration, CalibrationSettings, calibrate_rig
 from hybridve.calib.check import RigCheck, check_rig
 from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.link import NamedBoard
 from hybridve.calib.observe import CameraInput, find_boards
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict
@@ -68,7 +68,7 @@ def calibrate_session(session: Session, progress: Progress | None = None) -> Cal
     )
 
 
-def session_boards(session: Session) -> list[NamedBoard]:
+def session_boards(session: Session) -> list[Board]:
     """Return the boards that a session describes.
 
     Raises
@@ -138,7 +138,7 @@ def take_elsewhere(session: Session, progress: Progress | None = None) -> Rig:
         If the rig cannot be read, or does not fit the boards that the session's cameras saw.
     """
     assert session.rig_file is not None
-    rig = _import(session, session.rig_file, _calibrated_sizes(session))
+    rig = _import(session, session.rig_file, board_sizes(session))
     seeing = [camera for camera in session.cameras if camera.extrinsics is not None]
     if session.target is None or len(seeing) < 2:
         _log.warning(
@@ -149,9 +149,7 @@ def take_elsewhere(session: Session, progress: Progress | None = None) -> Rig:
         return rig
     check = check_session(session, rig, progress)
     if not check.is_trustworthy:
-        raise CalibrationError(
-            f"{session.path}: rig {session.rig_file.pattern!r}: {check.message}"
-        )
+        raise CalibrationError(f"{session.path}: rig {session.rig_file.pattern!r}: {check.message}")
     return Rig(rig.cameras, {**rig.provenance, "check": asdict(check)}, rig.covariance, rig.mounts)
 
 
@@ -191,8 +189,8 @@ def _recorded_sizes(session: Session) -> dict[str, tuple[int, int]]:
     return sizes_px
 
 
-def _calibrated_sizes(session: Session) -> dict[str, tuple[int, int]]:
-    """Return image sizes from the recordings or, where there is none yet, from the board's."""
+def board_sizes(session: Session) -> dict[str, tuple[int, int]]:
+    """Return image sizes from the recordings or, where there is none yet, from the boards'."""
     sizes_px = {}
     for camera in session.cameras:
         source = camera.recording or camera.extrinsics or camera.intrinsics
