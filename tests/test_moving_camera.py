@@ -27,6 +27,8 @@ from hybridve.calib.target import Chessboard
 from hybridve.hull.capture.recording import stored_silhouettes
 from hybridve.hull.capture.rig import rig_digest
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.contact.backtrack import first_contact, interpolated_hull
+from hybridve.hull.contact.detect import detect_contacts
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.contact.spacing import Move
@@ -39,9 +41,17 @@ from hybridve.hull.evaluate import (
     resolved_settings,
     views_at,
 )
+from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
-from hybridve.hull.query.silhouettes import Views, interpolated_views, make_hull, make_views
+from hybridve.hull.query.reference import contains_points
+from hybridve.hull.query.silhouettes import (
+    Hull,
+    Views,
+    interpolated_views,
+    make_hull,
+    make_views,
+)
 from hybridve.hull.report.schema import FrameResult
 from hybridve.hull.show import draw_cameras, draw_scene, take_shot
 from hybridve.hull.spacing import Layout, replay
@@ -95,11 +105,23 @@ def true_rig(frame: int) -> Rig:
     return Rig((*fixed, camera("head", head_pose(frame))), mounts={"head": MOUNT})
 
 
-def views_of(rig: Rig) -> Views:
+def panned_rig(pan_rad: float) -> Rig:
+    """Return the rig with a head that stands still and looks aside by an angle."""
+    still = true_rig(0)
+    pose = compose(turn_about_y(pan_rad), look_at(np.array([-0.8, 1.9, 0.5]), np.zeros(3)))
+    return Rig((*still.cameras[:3], camera("head", pose)))
+
+
+def turn_about_y(angle_rad: float) -> Pose:
+    return np.column_stack([cv2.Rodrigues(np.array([0.0, angle_rad, 0.0]))[0], np.zeros(3)])
+
+
+def views_of(rig: Rig, origin_world: NDArray[np.float64] | None = None) -> Views:
     return make_views(
         tuple(one.name for one in rig.cameras),
         np.array([SIZE_PX] * len(rig.cameras)),
         np.array([one.pinhole @ one.cam_from_world for one in rig.cameras]),
+        origin_world=origin_world,
     )
 
 
@@ -423,6 +445,9 @@ def test_spacing_sweep_and_pictures_see_the_cameras_where_they_were(
     assert shot.contacts[0].collides
     assert draw_cameras(shot).size > 0
     assert draw_scene(shot, (320, 240)).size > 0
+    last = take_shot(chain, 7, engine)
+    true_masks = ball_masks(views_of(true_rig(7)), CENTERS[7], RADIUS_M)
+    assert [int(mask.sum()) for mask in last.masks] == [int(mask.sum()) for mask in true_masks]
     with pytest.raises(SessionError, match=f"frame {LOST}: no tracked pose of camera 'head'"):
         take_shot(chain, LOST, engine)
 
@@ -509,6 +534,56 @@ def test_a_turn_of_any_angle_is_shared_out(angle_rad: float, fraction: float) ->
     )
     assert np.abs(error).max() < 1e-11 + 1e-7 * (angle_rad > 1)
     np.testing.assert_array_equal(middle.img_from_local[0], views.img_from_local[0])
+
+
+PANS_RAD = (-0.2, 0.25)
+
+
+def two_hulls(x_before_m: float, x_after_m: float) -> tuple[Hull, Hull]:
+    """Return the hulls of a ball in two frames between which the head turned aside."""
+    origin = np.zeros(3)
+    views = [views_of(panned_rig(pan), origin) for pan in PANS_RAD]
+    before, after = (
+        make_hull(one, ball_masks(one, np.array([x_m, 0.0, 0.0]), RADIUS_M))
+        for one, x_m in zip(views, (x_before_m, x_after_m), strict=True)
+    )
+    return before, after
+
+
+@pytest.mark.parametrize("fraction", [0.25, 0.5, 0.75])
+def test_the_hull_between_two_frames_is_that_of_cameras_halfway(fraction: float) -> None:
+    before, after = two_hulls(-0.35, -0.25)
+    center = np.array([-0.35 + 0.1 * fraction, 0.0, 0.0])
+    pan = PANS_RAD[0] + fraction * (PANS_RAD[1] - PANS_RAD[0])
+    views = views_of(panned_rig(pan), np.zeros(3))
+    true = make_hull(views, ball_masks(views, center, RADIUS_M))
+    points = center + np.random.default_rng(0).uniform(-0.2, 0.2, (20_000, 3))
+
+    found = interpolated_hull(before, after, fraction)
+
+    expected, inside = contains_points(true, points), contains_points(found, points)
+    assert (inside != expected).sum() < 0.05 * expected.sum()
+
+
+def test_first_contact_is_found_while_the_camera_turns_the_object_through_its_image(
+    chain: Chain, engine: Engine
+) -> None:
+    before, after = two_hulls(-0.32, -0.22)
+    (body,) = chain.bodies
+    (contact,) = detect_contacts(after, [body], engine)
+    assert contact.collides
+    assert not detect_contacts(before, [body], engine)[0].collides
+    axis = np.array([1.0, 0.0, 0.0])
+    gaps_m = [
+        -HALF_M - x_m - ball_extent(hull.views, np.array([x_m, 0, 0]), RADIUS_M, axis, np.zeros(4))
+        for hull, x_m in ((before, -0.32), (after, -0.22))
+    ]
+
+    with Certifier(1e-4) as certifier:
+        found = first_contact(before, after, body, contact, certifier, engine)
+
+    assert found.status == ""
+    assert abs(found.fraction - gaps_m[0] / (gaps_m[0] - gaps_m[1])) < 0.1
 
 
 def test_views_of_other_cameras_have_nothing_between_them() -> None:
