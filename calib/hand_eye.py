@@ -181,7 +181,9 @@ def mount_camera(
     mount : Mount
         Both fixed poses.
     diagnostics : dict
-        As plain JSON values: ``instants`` and ``views`` that were used; ``untracked`` instants;
+        As plain JSON values: how many ``instants`` and ``views`` were used, and the
+        ``middle_instant`` of them, to draw the camera at; ``looks_turned``, views whose board was
+        listed another way round than most; ``untracked`` instants;
         ``dropped``, by image, and why; ``rms_px`` of all corners used, and ``closed_form_rms_px``;
         ``turn_deg``, how far the tracker turned about three axes, most first; ``tracker_scale``
         and ``tracker_scale_std``; ``parameters`` and their ``covariance`` (12, 12), rad and metres;
@@ -213,12 +215,14 @@ def mount_camera(
         if not is_used
     }
     used = [view for view, is_used in zip(views, fit.used, strict=True) if is_used]
+    instants = sorted({view.instant for view in used})
     about = _uncertainty(camera, used, fit.mount)
     scale, scale_std = about.pop("tracker_scale"), about.pop("tracker_scale_std")
     if abs(scale - 1.0) > max(_SCALE, _SCALE_SIGMAS * scale_std):
         raise _wrong_unit(camera, scale)
     return fit.mount, {
-        "instants": len({view.instant for view in used}),
+        "instants": len(instants),
+        "middle_instant": instants[len(instants) // 2],
         "views": len(used),
         "looks_turned": sum(view.look != 0 for view in used),
         "untracked": untracked,

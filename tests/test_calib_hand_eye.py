@@ -125,6 +125,7 @@ def test_boards_seen_without_noise_give_the_mount_back(seed: int) -> None:
 
     assert apart(mount, walk.mount) < 1e-9
     assert about["views"] == about["instants"] == 25
+    assert about["middle_instant"] == 12
     assert about["rms_px"] < 1e-8
     assert about["tracker_scale"] == pytest.approx(1.0, abs=1e-9)
     assert np.abs(about["covariance"]).max() < 1e-18

@@ -1,5 +1,6 @@
 """A camera that moves with a tracker, through the whole chain, on a ball whose hull is known."""
 
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -283,6 +284,66 @@ def test_a_mount_calibrated_from_noisy_boards_gives_the_same_answers(
             assert one.clearance is not None
             assert true.clearance is not None
             assert abs(one.clearance.upper_m - true.clearance.upper_m) < 0.005
+
+
+def write_boards(folder: Path, board: Chessboard, noise_px: float) -> str:
+    """Write what the cameras saw of a still board about the origin; return its part of the session.
+
+    The head walked about it, the others stood: corners in files, OpenCV's pixels, dull pictures.
+    """
+    rng = np.random.default_rng(0)
+    world_from_board = np.column_stack([np.eye(3), -board.center_board])
+    tables, poses = [], {}
+    for one in true_rig(0).cameras:
+        (folder / one.name / "board").mkdir()
+        rows = ["image,corner,x,y"]
+        for instant in range(30 if one.name == "head" else 2):
+            pose = one.cam_from_world
+            if one.name == "head":
+                center = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(0.9, 1.3)])
+                pose = look_at(center, rng.uniform(-0.05, 0.05, 3), rng.uniform(-0.6, 0.6))
+                poses[instant] = tracked(pose)
+            points = transform(compose(pose, world_from_board), board.points_board)
+            pixels = img_from_cam(one, points) - 0.5 + rng.normal(0.0, noise_px, (len(points), 2))
+            rows += [f"{instant}.png,{k},{x},{y}" for k, (x, y) in enumerate(pixels)]
+            dull = np.full(SIZE_PX[::-1], 128, np.uint8)
+            cv2.imwrite(str(folder / one.name / "board" / f"{instant}.png"), dull)
+        (folder / f"{one.name}_corners.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        params = f"[{FOCAL_PX}, {FOCAL_PX}, {SIZE_PX[0] / 2}, {SIZE_PX[1] / 2}]"
+        tables.append(
+            f'[[camera]]\nname = "{one.name}"\nmodel = "PINHOLE"\nparams = {params}\n'
+            f'masks = "{one.name}/*.png"\nextrinsics = "{one.name}/board/*.png"\n'
+            f'corners = "{one.name}_corners.csv"\n'
+        )
+    (folder / "head_board.csv").write_text(poses_csv(poses), encoding="utf-8")
+    tables[-1] += 'poses = "head.csv"\nextrinsics_poses = "head_board.csv"\n'
+    target = f"columns = {board.columns}\nrows = {board.rows}\nsquare_mm = {1e3 * board.square_m}\n"
+    return '[target]\nkind = "chessboard"\n' + target + "\n".join(tables)
+
+
+def test_a_session_with_a_moving_camera_is_calibrated_and_evaluated(
+    scene: Path, engine: Engine, tmp_path: Path, run: Run, results: list[FrameResult]
+) -> None:
+    path = write_session(tmp_path)
+    shutil.rmtree(tmp_path / "rig")
+    board = Chessboard(8, 5, 0.06)
+    path.write_text(SESSION_HEAD + write_boards(tmp_path, board, 0.02), encoding="utf-8")
+    for name in ("cube.obj", "scene.toml"):
+        shutil.copy(scene.parent / name, tmp_path / name)
+    # The board's own frame is the world: the scene moves with it.
+    with (tmp_path / "scene.toml").open("a", encoding="utf-8") as file:
+        file.write(f"translate_mm = {(1e3 * board.center_board).tolist()}\n")
+
+    assert run("calibrate", path, "--no-progress") == 0
+    found = list(evaluate(chain_of(path, tmp_path / "scene.toml"), engine))
+
+    for result, expected in zip(found, results, strict=True):
+        assert result.reason == expected.reason
+        for one, true in zip(result.findings, expected.findings, strict=True):
+            assert one.contact.certificate == true.contact.certificate
+            assert one.clearance is not None
+            assert true.clearance is not None
+            assert abs(one.clearance.upper_m - true.clearance.upper_m) < 0.008
 
 
 def test_a_frame_without_a_tracked_pose_is_a_row_with_the_reason(
