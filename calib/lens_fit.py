@@ -73,6 +73,9 @@ _MIN_CORNERS = 6
 _LINE = 1e-6
 _NEARLY_LINE = 0.05
 
+#: Image width for which the limits of `LensSettings` are meant.
+_USUAL_WIDTH_PX = 640
+
 #: A corner that misses by more than both is an outlier, if not more than a share of its view are.
 _OUTLIER_SIGMA = 6.0
 _OUTLIER_PX = 3.0
@@ -129,7 +132,8 @@ class LensSettings:
     Attributes
     ----------
     max_view_px : float
-        A view whose corners miss by more than this, root mean square, is dropped.
+        A view whose corners miss by more than this, root mean square, is dropped; in images wider
+        than 640 pixels in proportion.
     max_view_medians : float
         So is one that misses by this many times the median of its camera's views, ...
     always_good_px : float
@@ -146,10 +150,13 @@ class LensSettings:
     min_views: int = 3
     loss_px: float = 1.0
 
-    def limit_px(self, errors_px: NDArray[np.float64]) -> float:
+    def limit_px(self, errors_px: NDArray[np.float64], width_px: int) -> float:
         """Return the largest error of a view that is accepted, from those of all (V,)."""
+        most = self.max_view_px * max(1.0, width_px / _USUAL_WIDTH_PX)
+        if not len(errors_px):
+            return most
         relative = self.max_view_medians * float(np.median(errors_px))
-        return min(self.max_view_px, max(relative, self.always_good_px))
+        return min(most, max(relative, self.always_good_px))
 
 
 _DEFAULTS = LensSettings()
@@ -980,7 +987,7 @@ def fit_batch(
         errors_px = np.array(
             [np.sqrt((m[k] ** 2).mean()) for m, k in zip(misses_px, new_mask, strict=True)]
         )
-        limit_px = settings.limit_px(errors_px[used]) if len(used) else settings.max_view_px
+        limit_px = settings.limit_px(errors_px[used], size_px[0])
         bad = used[errors_px[used] > limit_px]
         bad = bad[np.argsort(-errors_px[bad], kind="stable")][: max(1, len(used) // 5)]
         good = errors_px <= limit_px
