@@ -86,7 +86,7 @@ _VIEWS_PX = 6e6
 _TRAVEL = 0.3
 
 #: How well a point's surroundings correlate with what is printed there.
-_LIKENESS = 0.6
+_LIKENESS = 0.65
 
 #: A point further than this from where its neighbours have it is none, in cells: by how far points
 #: are usually off, within bounds. Judged is a point with so many neighbours.
@@ -823,7 +823,8 @@ def _refine(
         moved = move_to_symmetry(view, moved, cell, blur_px, weights)
         moved = middles + np.clip(moved - middles, -_TRAVEL * cell, _TRAVEL * cell)
     sampled = _sample(view, moved[:, None] + both)
-    travelled = np.abs(moved - middles).max(axis=1) >= _TRAVEL * cell
+    # A point that was found stays; one that a better view moves was none.
+    travelled = np.abs(moved - middles).max(axis=1) >= np.where(known, 0.05, _TRAVEL) * cell
     beside_edges = (np.abs(both) > 0.05 * cell).all(axis=1)
     likeness = np.where(travelled, 0.0, _likeness(sampled, signs * beside_edges))
     pixels = (_terms((moved - middles) / cell)[:, None] @ maps)[:, 0]

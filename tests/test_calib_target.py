@@ -295,3 +295,22 @@ def test_a_file_without_corners_is_named(tmp_path: Path, name: str, text: str) -
 def test_a_missing_corners_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="no such corners file"):
         read_corners(tmp_path / "corners.xml")
+
+
+def test_measured_sides_of_squares_place_the_corners() -> None:
+    board = Chessboard(8, 6, 0.115, 0.1146)
+
+    np.testing.assert_allclose(board.points_board[[1, 8]], [[0.115, 0, 0], [0, 0.1146, 0]])
+    assert str(board) == "8x6 inner corners, 115 by 114.6 mm squares"
+    for look, listing in enumerate(board.looks):
+        np.testing.assert_allclose(
+            transform(board.board_from_turned(look), board.points_board),
+            board.points_board[listing],
+            atol=1e-12,
+        )
+
+
+def test_a_board_whose_two_sides_nothing_tells_apart_is_refused() -> None:
+    assert len(Chessboard(7, 7, 0.1, 0.11).looks) == 2
+    with pytest.raises(CalibrationError, match="nothing tells x from y"):
+        Chessboard(6, 6, 0.1, 0.11)
