@@ -325,8 +325,7 @@ class _Tools:
                 chain.rig.provenance,
                 [shift_px[name] for name in names],
                 settings.doubt,
-                # A covariance holds where cameras stand still.
-                chain.rig if not chain.rig.mounts else None,
+                chain.rig,
             )
             doubter = Doubter(errors, settings.doubt)
         with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:
@@ -337,6 +336,7 @@ class _Tools:
 class _Seen:
     """One frame by itself."""
 
+    index: int
     time_s: float
     hull: Hull
     contacts: list[Contact]
@@ -363,7 +363,8 @@ def _look(
         ]
         contacts, clearances = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     watch.lap("clearance")
-    return _Seen(silhouettes.index / chain.session.fps, hull, contacts, clearances)
+    time_s = silhouettes.index / chain.session.fps
+    return _Seen(silhouettes.index, time_s, hull, contacts, clearances)
 
 
 def _findings(
@@ -380,7 +381,7 @@ def _findings(
         findings.append(finding)
     watch.lap("respond")
     if tools.doubter is not None:
-        doubts = tools.doubter.frame(seen.hull)
+        doubts = tools.doubter.frame(seen.hull, chain.tracks.at(seen.index))
         findings = [
             replace(
                 finding,

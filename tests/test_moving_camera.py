@@ -22,18 +22,19 @@ from hybridve.calib.errors import CalibrationError, SessionError
 from hybridve.calib.hand_eye import mount_camera
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.pose import Pose, compose, invert, transform
-from hybridve.calib.rig import Mount, Rig
+from hybridve.calib.rig import POSE_PARAMETERS, Mount, Rig, RigCovariance
 from hybridve.calib.rig_io import read_rig, write_rig
 from hybridve.calib.target import Chessboard
 from hybridve.hull.capture.recording import stored_silhouettes
 from hybridve.hull.capture.rig import rig_digest
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.backtrack import first_contact, interpolated_hull
+from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import detect_contacts
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.contact.spacing import Move
-from hybridve.hull.contact.uncertainty import DoubtSettings
+from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
 from hybridve.hull.evaluate import (
     Chain,
     EvaluateSettings,
@@ -344,6 +345,41 @@ def test_a_session_with_a_moving_camera_is_calibrated_and_evaluated(
             assert one.clearance is not None
             assert true.clearance is not None
             assert abs(one.clearance.upper_m - true.clearance.upper_m) < 0.008
+
+
+def test_doubt_comes_from_the_covariance_where_the_camera_was(
+    scene: Path, engine: Engine, tmp_path: Path
+) -> None:
+    path = write_session(tmp_path)
+    labels = [
+        f"{one.name} {name}"
+        for one in true_rig(0).cameras
+        for name in (*POSE_PARAMETERS, "fx", "fy", "cx", "cy")
+    ]
+    of_camera = [1e-6] * 3 + [4e-6] * 3 + [0.1] * 4
+    # The head errs most, so that it matters where it was.
+    deviations = np.sqrt(np.array([*(of_camera * 3), *(100.0 * np.array(of_camera))]))
+    covariance = RigCovariance(tuple(labels), np.diag(deviations**2))
+    rig = Rig(true_rig(0).cameras, {}, covariance, {"head": MOUNT})
+    write_rig(tmp_path / "rig" / "rig.json", rig)
+    chain = chain_of(path, scene)
+    names, settings = chain.views.names, DoubtSettings()
+
+    (part,) = chain.scene.objects
+    for result in evaluate(chain, engine):
+        for finding in result.findings:
+            still = Rig(true_rig(result.index).cameras, {}, covariance)
+            errors = outline_errors(names, {}, [0.0] * len(names), settings, still)
+            masks = ball_masks(views_of(true_rig(result.index)), CENTERS[result.index], RADIUS_M)
+            hull = make_hull(views_at(chain, result.index), masks)
+            meter = ClearanceMeter(part.vertices_world, part.faces, is_closed=True)
+            assert finding.clearance is not None
+            assert finding.doubt is not None
+            expected = Doubter(errors, settings).frame(hull)
+            wanted = expected.doubt(meter, finding.contact, finding.clearance)
+            assert finding.doubt.std_m == pytest.approx(wanted.std_m, rel=1e-6)
+            if not finding.touches:
+                assert finding.doubt.std_m > 0.0
 
 
 def test_a_frame_without_a_tracked_pose_is_a_row_with_the_reason(

@@ -65,6 +65,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from hybridve.calib.pose import Pose
 from hybridve.calib.rig import Rig
 from hybridve.calib.uncertainty import undistorted_covariance
 from hybridve.hull.contact.bulge import real_upper
@@ -310,9 +311,22 @@ class Doubter:
         self._errors = errors
         self._settings = settings or DoubtSettings()
 
-    def frame(self, hull: Hull) -> "FrameDoubts":
-        """Return one that doubts all objects of a frame; what they share is computed once."""
-        return FrameDoubts(hull, self._errors, self._settings)
+    def frame(
+        self, hull: Hull, tracking_from_tracker: Mapping[str, Pose] | None = None
+    ) -> "FrameDoubts":
+        """Return one that doubts all objects of a frame; what they share is computed once.
+
+        Parameters
+        ----------
+        hull : Hull
+            Of the frame.
+        tracking_from_tracker : mapping of str to (3, 4) float64, optional
+            Where the trackers of moving cameras were.
+        """
+        errors = self._errors
+        if errors.rig is not None and tracking_from_tracker:
+            errors = replace(errors, rig=errors.rig.at(tracking_from_tracker))
+        return FrameDoubts(hull, errors, self._settings)
 
 
 @dataclass(eq=False)
