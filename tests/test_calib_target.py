@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.lens_fit import locate_board
 from hybridve.calib.pose import transform
-from hybridve.calib.solve import locate_board
 from hybridve.calib.target import (
     Chessboard,
     detect_corners,
