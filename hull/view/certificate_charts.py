@@ -36,7 +36,7 @@ _BLUE, _ORANGE, _GREEN, _RED = "#0072B2", "#D55E00", "#009E73", "#B00020"
 
 #: Light to dark, so that the order survives a grey print; blank is none of its colours.
 _ERROR_COLOURS = LinearSegmentedColormap.from_list(
-    "error", ["#E3F0F8", "#9CCBE6", "#4E9FCB", "#0A5A92", "#06304F"]
+    "error", ["#EAF4FA", "#B9DAEE", "#7DB8DC", "#4391C4", "#1C6CA3"]
 )
 _BLANK = "#F1F1F1"
 
@@ -201,7 +201,7 @@ def _draw_image_errors(axes: Axes, alone: Rig, volume: Volume) -> None:
 
 
 def _short(value: float) -> str:
-    return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def _draw_iso_lines(
@@ -414,7 +414,7 @@ def draw_errors(rig: Rig, volume: Volume) -> Figure | None:
     levels = spread_levels(errors_mm, 6)
     scale = Normalize(least, most)
     for number, ((what, _), height_m, layer) in enumerate(zip(_SLICES, z, errors_mm, strict=True)):
-        axes = figure.add_axes((0.052 + 0.298 * number, 0.115, 0.28, 0.81))
+        axes = figure.add_axes((0.06 + 0.2955 * number, 0.115, 0.28, 0.81))
         half = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
         axes.set_facecolor("white")
         box = (x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1])
