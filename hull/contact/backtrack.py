@@ -20,7 +20,9 @@ pixels are good enough.
 An outline that moves by one pixel passes that pixel half-way, by construction: a thing slower than
 some pixels a frame has its contact in the middle, which is the best that can be said.
 
-A camera that moves is taken to go straight and to turn evenly between its two poses.
+A camera that moves is taken to go straight and to turn evenly between its two poses. Both of its
+silhouettes are first turned to where it looks at the instant, which is exact but for what its
+straight way shifts; the rest is motion as above.
 
 What no shift explains and no blend keeps, something that was not there a frame before, is told by
 the status "outline lost": then the instant is unknown within the frame.
@@ -175,14 +177,10 @@ def interpolated_hull(before: Hull, after: Hull, fraction: float) -> Hull:
     ValueError
         If the fraction is not within 0..1, or the two hulls are not of the same cameras.
     """
-    views = interpolated_views(before.views, after.views, fraction)
-    cameras = range(len(before.views))
-    masks = interpolate_masks(
-        [before.mask(camera) for camera in cameras],
-        [after.mask(camera) for camera in cameras],
-        fraction,
-    )
-    return make_hull(views, masks)
+    if not 0.0 <= fraction <= 1.0:
+        raise ValueError(f"fraction is {fraction}, expected 0..1")
+    windows = [(0, int(height), 0, int(width)) for width, height in before.views.sizes_px]
+    return _Between(before, after, windows).hull(fraction)
 
 
 def first_contact(
@@ -217,28 +215,17 @@ def first_contact(
     ValueError
         If the hulls are not of the same cameras, or the contact has neither points nor a witness.
     """
-    interpolated_views(before.views, after.views, 0.5)  # or they are refused
+    between = _Between(before, after, _windows(before.views, body))
     if not contact.collides and not np.isfinite(contact.witness_world).all():
         raise ValueError(f"object {body.name}: the contact has neither points nor a witness")
     probe = _Probe(body, certifier, engine)
     if probe.touches(before):
         return FirstContact(0.0, 1.0, probe.patch_center(before), "touches before")
-    outlines = [
-        _follow(before.mask(camera), after.mask(camera), window)
-        for camera, window in enumerate(_windows(before.views, after.views, body))
-    ]
-
-    def hull_at(fraction: float) -> Hull:
-        if fraction == 1.0:
-            return after
-        views = interpolated_views(before.views, after.views, fraction)
-        return make_hull(views, [outline.at(fraction) for outline in outlines])
-
     free, touching = 0.0, 1.0
     last_free, first_touching = before, after
     for step in range(1, _N_COARSE + 1):
         fraction = step / _N_COARSE
-        hull = hull_at(fraction)
+        hull = between.hull(fraction)
         if probe.touches(hull):
             touching, first_touching = fraction, hull
             break
@@ -247,12 +234,13 @@ def first_contact(
         return FirstContact(1.0, 1.0, _point_of(contact), "no touch found")
     while touching - free > _RESOLUTION:
         middle = 0.5 * (free + touching)
-        hull = hull_at(middle)
+        hull = between.hull(middle)
         if probe.touches(hull):
             touching, first_touching = middle, hull
         else:
             free, last_free = middle, hull
     point_world = probe.patch_center(first_touching)
+    outlines = between.outlines(touching)
     if _outline_is_lost(outlines, last_free, first_touching, touching, point_world):
         return FirstContact(0.5, 0.5, probe.patch_center(after), "outline lost")
     return FirstContact(touching, max(touching, 1.0 - touching), point_world, "")
@@ -434,6 +422,76 @@ def _follow(before: NDArray[np.uint8], after: NDArray[np.uint8], window: _Box) -
         _signed_distance(after[_slices(crop)]),
         tuple(move for move, _ in swept),
     )
+
+
+class _Between:
+    """The hulls of instants between two frames.
+
+    Parameters
+    ----------
+    before, after : Hull
+        Of the two frames, of the same cameras.
+    windows : list of box
+        Where the silhouettes of each camera have to be right; those of a camera that moves are so
+        everywhere, as an object may pass through any part of its image.
+
+    Raises
+    ------
+    ValueError
+        If the hulls are not of the same cameras.
+    """
+
+    def __init__(self, before: Hull, after: Hull, windows: list[_Box]) -> None:
+        interpolated_views(before.views, after.views, 0.5)  # or they are refused
+        self._before, self._after = before, after
+        first, second = before.views.img_from_local, after.views.img_from_local
+        self._still = {
+            camera: _follow(before.mask(camera), after.mask(camera), window)
+            for camera, window in enumerate(windows)
+            if (first[camera] == second[camera]).all()
+        }
+
+    def outlines(self, fraction: float) -> list[_Outline]:
+        """Return the outlines of all cameras; those of moving ones as they look at an instant."""
+        views = interpolated_views(self._before.views, self._after.views, fraction)
+        return [
+            self._still[camera] if camera in self._still else self._turned(camera, views)
+            for camera in range(len(views))
+        ]
+
+    def hull(self, fraction: float) -> Hull:
+        """Return the hull of an instant."""
+        if fraction == 1.0:
+            return self._after
+        views = interpolated_views(self._before.views, self._after.views, fraction)
+        return make_hull(views, [outline.at(fraction) for outline in self.outlines(fraction)])
+
+    def _turned(self, camera: int, views: Views) -> _Outline:
+        height, width = self._before.mask(camera).shape
+        before, after = (
+            _turned_mask(
+                hull.mask(camera),
+                hull.views.img_from_local[camera, :, :3],
+                views.img_from_local[camera, :, :3],
+            )
+            for hull in (self._before, self._after)
+        )
+        return _follow(before, after, (0, height, 0, width))
+
+
+def _turned_mask(
+    mask: NDArray[np.uint8], from_local: NDArray[np.float64], to_local: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """Return a silhouette as its camera sees it turned on the spot; 0 where it saw nothing.
+
+    The projections (3, 3), without their last columns, hold lens and rotation.
+    """
+    if (from_local == to_local).all():
+        return mask
+    centre = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV's is at 0
+    turn = np.linalg.inv(centre) @ to_local @ np.linalg.inv(from_local) @ centre
+    size = (mask.shape[1], mask.shape[0])
+    return np.asarray(cv2.warpPerspective(mask, turn, size, flags=cv2.INTER_NEAREST), np.uint8)
 
 
 def _binary(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -685,21 +743,16 @@ def _box_of(mask: NDArray[np.uint8]) -> _Box:
     return top, top + height, left, left + width
 
 
-def _windows(views: Views, after: Views, body: Body) -> list[_Box]:
-    """Return for each camera a box that the object projects into, with some pixels to spare.
-
-    The whole image of a camera that moves: on its way the object may pass anywhere.
-    """
+def _windows(views: Views, body: Body) -> list[_Box]:
+    """Return for each camera a box that the object projects into, with some pixels to spare."""
     ends_local = np.stack([body.lower_world, body.upper_world]) - views.origin_world
     corners_local = np.array(list(itertools.product(*ends_local.T)))  # (8, 3)
     windows = []
-    for (width, height), matrix, later in zip(
-        views.sizes_px.tolist(), views.img_from_local, after.img_from_local, strict=True
-    ):
+    for (width, height), matrix in zip(views.sizes_px.tolist(), views.img_from_local, strict=True):
         whole = (0, height, 0, width)
         projected = corners_local @ matrix[:, :3].T + matrix[:, 3]  # (8, 3)
-        if projected[:, 2].min() <= 1e-6 or (matrix != later).any():
-            windows.append(whole)  # part of it is behind the camera, or the camera moves
+        if projected[:, 2].min() <= 1e-6:
+            windows.append(whole)  # part of it is behind the camera
             continue
         pixels = projected[:, :2] / projected[:, 2:]
         left, top = np.clip(np.floor(pixels.min(axis=0)) - 2, 0, (width, height)).tolist()
