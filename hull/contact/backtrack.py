@@ -215,12 +215,13 @@ def first_contact(
     ValueError
         If the hulls are not of the same cameras, or the contact has neither points nor a witness.
     """
-    between = _Between(before, after, _windows(before.views, body))
+    interpolated_views(before.views, after.views, 0.5)  # other cameras are refused
     if not contact.collides and not np.isfinite(contact.witness_world).all():
         raise ValueError(f"object {body.name}: the contact has neither points nor a witness")
     probe = _Probe(body, certifier, engine)
     if probe.touches(before):
         return FirstContact(0.0, 1.0, probe.patch_center(before), "touches before")
+    between = _Between(before, after, _windows(before.views, body))
     free, touching = 0.0, 1.0
     last_free, first_touching = before, after
     for step in range(1, _N_COARSE + 1):
@@ -442,7 +443,7 @@ class _Between:
     """
 
     def __init__(self, before: Hull, after: Hull, windows: list[_Box]) -> None:
-        interpolated_views(before.views, after.views, 0.5)  # or they are refused
+        interpolated_views(before.views, after.views, 0.5)  # other cameras are refused
         self._before, self._after = before, after
         first, second = before.views.img_from_local, after.views.img_from_local
         self._still = {
