@@ -75,7 +75,7 @@ class Board(Protocol):
         ...
 
     def board_from_turned(self, look: int) -> Pose:
-        """Return the motion (3, 4) that maps ``points_board`` onto ``points_board[looks[look]]``."""
+        """Return the motion (3, 4) of ``points_board`` onto ``points_board[looks[look]]``."""
         ...
 
     def detect(self, image: NDArray[Any], effort: Effort = "thorough") -> Detection:

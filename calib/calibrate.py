@@ -16,15 +16,17 @@ import importlib.metadata
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.board import Board, Observations, is_seen
-from hybridve.calib.bundle import POSE, Adjusted, Bundle, BundleView, adjust
-from hybridve.calib.camera import Camera
+from hybridve.calib.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose
+from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.clock import estimate_offsets, resampled
+from hybridve.calib.consensus import common_pose
 from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.hand_eye import mount_camera
@@ -39,7 +41,9 @@ from hybridve.calib.rig import Mount, Rig, RigCovariance
 from hybridve.calib.uncertainty import (
     Noise,
     camera_parameter_names,
+    in_world,
     measure_noise,
+    parameter_slices,
     rig_covariance,
 )
 from hybridve.calib.world import Mark, SeenBoards, place_world
@@ -62,6 +66,21 @@ _WRONG_CLIP_PX = 5.0
 #: Where the two poses that a plane allows differ in error by less than this factor, its tilt is
 #: not determined.
 _TILT_FACTOR = 1.5
+
+#: A point may lie outside its image by this share of the longer side, not further.
+_BEYOND = 0.02
+
+#: Cameras do not agree where the clip misses the rig by so many times what it misses their lenses
+#: alone, and by more than this. The camera is named whose pairs with the others differ so many
+#: times more than all other pairs.
+_DISAGREES_FACTOR = 3.0
+_DISAGREES_PX = 0.2
+_ODD_FACTOR = 2.0
+
+#: Standard deviation of a coordinate of a click, pixels, and the step (standard deviations of the
+#: rig's parameters, pixels of clicks) by which derivatives of the world are taken.
+_CLICK_PX = 0.5
+_WORLD_STEP = 1e-2
 
 #: Outliers that are listed one by one.
 _TOLD_OUTLIERS = 50
@@ -182,8 +201,6 @@ def calibrate_rig(
         if together
         for observed in observe_boards(boards, together, observe, progress, cache)
     }
-    if not cameras:
-        raise CalibrationError("there is no camera to calibrate; name at least one")
     observations = [seen[camera.name] for camera in cameras]
     return solve_rig(boards, observations, settings, progress, requests, tracks)
 
@@ -197,6 +214,7 @@ def solve_rig(
     tracks: Mapping[str, Mapping[int, Pose]] | None = None,
 ) -> Calibration:
     """Solve lenses and poses from the points that were seen: the quick half of `calibrate_rig`."""
+    _check(boards, observations)
     report = progress or _no_progress
     requests, tracks = requests or {}, tracks or {}
     # The rig's numbers must not depend on the order in which cameras are listed.
@@ -223,6 +241,42 @@ def solve_rig(
 
 def _no_progress(what: str, done: int, total: int) -> None:
     del what, done, total
+
+
+def _check(boards: Sequence[Board], observations: Sequence[Observations]) -> None:
+    """Refuse what no camera can have seen.
+
+    Raises
+    ------
+    CalibrationError
+        Naming the camera.
+    """
+    if not observations:
+        raise CalibrationError("there is no camera to calibrate; name at least one")
+    names = [seen.name for seen in observations]
+    for seen in observations:
+        if names.count(seen.name) > 1:
+            raise CalibrationError(f"camera {seen.name!r} is listed {names.count(seen.name)} times")
+        if seen.model != AUTO_MODEL and seen.model not in N_PARAMS:
+            raise CalibrationError(
+                f"camera {seen.name!r}: unknown camera model {seen.model!r}; one of "
+                f"{AUTO_MODEL}, {', '.join(N_PARAMS)}"
+            )
+        for sighting in seen.sightings:
+            n_points = len(boards[sighting.board].points_board)
+            if len(sighting.pixels) != n_points:
+                raise CalibrationError(
+                    f"camera {seen.name!r}: {sighting.image} has {len(sighting.pixels)} points, "
+                    f"expected the {n_points} of {boards[sighting.board]}"
+                )
+            beyond_px = np.maximum(-sighting.pixels, sighting.pixels - seen.size_px)
+            if np.nanmax(beyond_px, initial=0.0) > _BEYOND * max(seen.size_px):
+                raise CalibrationError(
+                    "camera {!r}: {} has points outside an image of {}x{} pixels; were stills, "
+                    "clip and corners recorded in the same mode?".format(
+                        seen.name, sighting.image, *seen.size_px
+                    )
+                )
 
 
 # --- Lenses and clocks ------------------------------------------------------------------------
@@ -333,6 +387,9 @@ def _solve_fixed(
     rough = adjust(bundle, settings.lens.loss_px)
     if is_still:
         _refuse_wrong_clips(rough, linked)
+    linked = replace(
+        linked, warnings=(*linked.warnings, *_disagreeing(boards, lenses, linked, rough))
+    )
     cleaned, outliers = _without_outliers(rough)
     adjusted = adjust(cleaned)
     placed = place_world(
@@ -346,18 +403,70 @@ def _solve_fixed(
         logger.warning("%s", warning)
     rig_from_world = invert(placed.world_from_rig)
     noise = measure_noise(adjusted)
-    return _Solved(
-        adjusted,
-        linked,
-        noise,
-        tuple(
-            replace(camera, cam_from_world=_rigid(compose(camera.cam_from_world, rig_from_world)))
-            for camera in adjusted.bundle.cameras
-        ),
-        rig_covariance(adjusted, noise.smooth_px),
-        placed.world_from_rig,
-        outliers,
+    in_the_world = tuple(
+        replace(camera, cam_from_world=_rigid(compose(camera.cam_from_world, rig_from_world)))
+        for camera in adjusted.bundle.cameras
     )
+    covariance = rig_covariance(adjusted, noise.smooth_px)
+    if settings.world != "board":
+        # The board is held, and so without error; a world found by the cameras shares theirs.
+        covariance = in_world(
+            covariance,
+            in_the_world,
+            *_world_errors(boards, linked, adjusted.bundle, covariance, settings),
+        )
+    return _Solved(
+        adjusted, linked, noise, in_the_world, covariance, placed.world_from_rig, outliers
+    )
+
+
+def _world_errors(
+    boards: Sequence[Board],
+    linked: Linked,
+    bundle: Bundle,
+    covariance: RigCovariance,
+    settings: CalibrationSettings,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how the world moves with the cameras' parameters (6, P), and by clicks (6, 6)."""
+
+    def place(cameras: Sequence[Camera], marks: Sequence[Mark]) -> Pose:
+        seen = _seen_boards(boards, linked, bundle)
+        return place_world(settings.world, cameras, seen, marks).world_from_rig
+
+    rig_from_world = invert(place(bundle.cameras, settings.marks))
+
+    def moved(cameras: Sequence[Camera], marks: Sequence[Mark], step: float) -> NDArray[np.float64]:
+        change = compose(place(cameras, marks), rig_from_world)
+        rotation = change[:, :3] - change[:, :3].T
+        omega = np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]]) / 2.0
+        return np.concatenate([omega, change[:, 3]]) / step
+
+    deviations = np.sqrt(np.diag(covariance.matrix))
+    by_parameter = np.zeros((POSE, len(deviations)))
+    for index, span in enumerate(parameter_slices(bundle.cameras)):
+        camera = bundle.cameras[index]
+        for column in range(span.start, span.stop):
+            step = _WORLD_STEP * float(deviations[column])
+            if step == 0:
+                continue  # given, and without error
+            nudge = np.zeros(span.stop - span.start)
+            nudge[column - span.start] = step
+            other = replace(
+                camera,
+                cam_from_world=moved_pose(camera.cam_from_world, nudge[:POSE]),
+                params=camera.params + nudge[POSE:],
+            )
+            cameras = (*bundle.cameras[:index], other, *bundle.cameras[index + 1 :])
+            by_parameter[:, column] = moved(cameras, settings.marks, step)
+    of_clicks = np.zeros((POSE, POSE))
+    for index, mark in enumerate(settings.marks):
+        for name, (x, y) in mark.pixels.items():
+            for click in ((x + _WORLD_STEP, y), (x, y + _WORLD_STEP)):
+                other_mark = replace(mark, pixels={**mark.pixels, name: click})
+                marks = (*settings.marks[:index], other_mark, *settings.marks[index + 1 :])
+                twist = moved(bundle.cameras, marks, _WORLD_STEP)
+                of_clicks += _CLICK_PX**2 * np.outer(twist, twist)
+    return by_parameter, of_clicks
 
 
 def _seen_boards(boards: Sequence[Board], linked: Linked, bundle: Bundle) -> SeenBoards:
@@ -428,13 +537,68 @@ def _refuse_wrong_clips(rough: Adjusted, linked: Linked) -> None:
             )
 
 
+def _disagreeing(
+    boards: Sequence[Board], lenses: Sequence[FittedLens], linked: Linked, rough: Adjusted
+) -> list[str]:
+    """Return a warning if no rig explains what the cameras saw, though their lenses do."""
+    squares: list[list[float]] = [[] for _ in lenses]
+    for view, missed in zip(rough.bundle.views, rough.residuals_px, strict=True):
+        if isinstance(linked.pose_names[view.pose][0], int):
+            squares[view.camera] += (missed[is_seen(missed)] ** 2).sum(axis=1).tolist()
+    missed_px = [float(np.sqrt(np.mean(own))) if own else 0.0 for own in squares]
+    worst = max(
+        range(len(lenses)),
+        key=lambda index: missed_px[index] / max(lenses[index].rms_px, _DISAGREES_PX),
+    )
+    alone_px = lenses[worst].rms_px
+    if not lenses[worst].views or missed_px[worst] < _DISAGREES_FACTOR * max(
+        alone_px, _DISAGREES_PX
+    ):
+        return []
+    odd = _odd_one_out(boards, linked, rough.bundle)
+    who = "the cameras do" if odd is None else f"camera {lenses[odd].camera.name!r} does"
+    return [
+        f"{who} not agree with {'one another' if odd is None else 'the others'}: the boards of the "
+        f"clip are missed by {missed_px[worst]:.2f} px in {lenses[worst].camera.name!r}, whose "
+        f"lens alone misses them by {alone_px:.2f} px; were the clips recorded at the same time, "
+        'frame by frame (sync = "estimate" if some are late), of a board as it is described, and '
+        "did no camera move?"
+    ]
+
+
+def _odd_one_out(boards: Sequence[Board], linked: Linked, bundle: Bundle) -> int | None:
+    """Return the camera whose poses against all others change while those of the others do not."""
+    placed: dict[tuple[int, int], dict[int, Pose]] = {}
+    for view in bundle.views:
+        camera = bundle.cameras[view.camera]
+        located = locate_board(camera, boards[view.board].points_board, view.pixels)
+        if located is not None and isinstance(linked.pose_names[view.pose][0], int):
+            placed.setdefault((view.pose, view.board), {})[view.camera] = located[0]
+    count = len(bundle.cameras)
+    apart = np.full((count, count), np.nan)
+    for one, other in combinations(range(count), 2):
+        both = [seen for seen in placed.values() if one in seen and other in seen]
+        if len(both) > 1:
+            measured = [compose(seen[other], invert(seen[one]))[None] for seen in both]
+            length_m = float(np.median([np.linalg.norm(seen[one][:, 3]) for seen in both]))
+            error = common_pose(measured, np.ones(len(measured)), length_m).error
+            apart[one, other] = apart[other, one] = error
+    for index in range(count):
+        own = apart[index][np.isfinite(apart[index])]
+        others = np.delete(np.delete(apart, index, axis=0), index, axis=1)
+        others = others[np.isfinite(others)]
+        if len(own) and len(others) and own.min() > _ODD_FACTOR * others.max():
+            return index
+    return None
+
+
 def _warn_of_flat_views(
     boards: Sequence[Board], cameras: Sequence[Camera], observations: Sequence[Observations]
 ) -> None:
     """Warn where a still board hardly tells how it is tilted."""
     for camera, seen in zip(cameras, observations, strict=True):
         factor = _other_tilt(boards, camera, seen)
-        if factor < _TILT_FACTOR:
+        if factor is not None and factor < _TILT_FACTOR:
             logger.warning(
                 "camera %s: the board clip hardly tells how the board is tilted (the other tilt "
                 "fits %.1f times worse); use a larger board or bring it nearer",
@@ -443,8 +607,11 @@ def _warn_of_flat_views(
             )
 
 
-def _other_tilt(boards: Sequence[Board], camera: Camera, seen: Observations) -> float:
-    """Return how many times worse the other pose of the clip's board fits that tells it best."""
+def _other_tilt(boards: Sequence[Board], camera: Camera, seen: Observations) -> float | None:
+    """Return how many times worse the other pose of the clip's board fits that tells it best.
+
+    None where no board of the clip can be located.
+    """
     factors = []
     for sighting in seen.sightings:
         if sighting.instant is None:
@@ -452,7 +619,7 @@ def _other_tilt(boards: Sequence[Board], camera: Camera, seen: Observations) -> 
         located = locate_board(camera, boards[sighting.board].points_board, sighting.pixels)
         if located is not None:
             factors.append(min(located[2] / max(located[1], 1e-9), 1e6))
-    return max(factors, default=1.0)
+    return max(factors, default=None)
 
 
 def _without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
@@ -658,8 +825,9 @@ def _told_of_camera(
     }
     if seen.spread_px is not None and np.isfinite(seen.spread_px):
         extrinsics["spread_over_clip_px"] = round(seen.spread_px, 4)
-    if seen.is_still:
-        extrinsics["other_tilt_times_worse"] = round(_other_tilt(boards, lens.camera, seen), 2)
+    other_tilt = _other_tilt(boards, lens.camera, seen) if seen.is_still else None
+    if other_tilt is not None:
+        extrinsics["other_tilt_times_worse"] = round(other_tilt, 2)
     told: dict[str, Any] = {
         "model": lens.camera.model,
         "intrinsics": {

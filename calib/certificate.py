@@ -58,6 +58,9 @@ _BETTER = 0.8
 #: Noise of single points should explain this share of the residuals at least.
 _LEAST_EXPLAINED = 0.5
 
+#: Residuals smaller than this explain nothing and need no explanation.
+_NEGLIGIBLE_PX = 0.01
+
 _ADVICE = {
     "focal length": "show it the board tilted by 30 to 45 degrees, near and far",
     "principal point": "show it the board tilted about both axes, and turned by 90 degrees",
@@ -325,7 +328,7 @@ def find_limit(rig: Rig, volume: Volume) -> Limit | None:
     chosen = np.linspace(0, len(volume.points_world) - 1, 60).round().astype(int)
     points = volume.points_world[np.unique(chosen)]
     best: tuple[float, Camera, str] | None = None
-    for camera, span in zip(rig.cameras, parameter_slices(rig), strict=True):
+    for camera, span in zip(rig.cameras, parameter_slices(rig.cameras), strict=True):
         for what, columns in _groups(camera).items():
             known = span.start + np.array(columns)
             error_m = _median_error(rig, points, _if_known(matrix, known))
@@ -334,7 +337,7 @@ def find_limit(rig: Rig, volume: Volume) -> Limit | None:
     if best is None or not np.isfinite(best[0]):
         return None
     _, camera, what = best
-    span = parameter_slices(rig)[rig.cameras.index(camera)]
+    span = parameter_slices(rig.cameras)[rig.cameras.index(camera)]
     known = span.start + np.array(_groups(camera)[what])
     errors_m = point_errors(rig, volume.points_world, _if_known(matrix, known)).radius95_m
     left_m = float(np.nanquantile(errors_m, _SHARE))
@@ -476,7 +479,7 @@ def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> t
                 f"determined (its image is known to {told.edge_error95_px:.1f} px only where it is "
                 f"known worst): {_ADVICE[kind]}"
             )
-    if noise.share_explained < _LEAST_EXPLAINED:
+    if noise.share_explained < _LEAST_EXPLAINED and noise.rms_px > _NEGLIGIBLE_PX:
         warnings.append(
             f"the noise of single points ({noise.rough_px:.2f} px) explains "
             f"{100 * noise.share_explained:.0f} % of the residuals: a lens model with more "

@@ -10,6 +10,7 @@ synthesis*, 2000 (section 9); Hartley and Zisserman, *Multiple View Geometry*, 2
 (sections 5.1 and 5.2, error of estimation and propagation of covariance).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,7 +22,7 @@ from hybridve.calib.board import is_seen
 from hybridve.calib.bundle import POSE, Adjusted, lens_derivatives
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, img_from_cam, parameter_names
-from hybridve.calib.pose import transform
+from hybridve.calib.pose import Pose, transform
 from hybridve.calib.rig import Rig, RigCovariance
 
 #: What is smooth over a board: polynomials in its coordinates up to this degree.
@@ -176,15 +177,57 @@ def _prior_of_lens(camera: Camera) -> NDArray[np.float64]:
     return prior
 
 
+def in_world(
+    covariance: RigCovariance,
+    cameras: Sequence[Camera],
+    world_by_parameter: NDArray[np.float64],
+    world_covariance: NDArray[np.float64],
+) -> RigCovariance:
+    """Return the covariance of cameras in a world that was found by means of them.
+
+    Parameters
+    ----------
+    covariance : RigCovariance
+        Of the cameras in the rig's frame.
+    cameras : sequence of Camera
+        In the world.
+    world_by_parameter : (6, P) float64
+        How world_from_rig changes with each parameter, as (omega, v) in the world's frame.
+    world_covariance : (6, 6) float64
+        Of world_from_rig for what else it was found by, in the same form.
+    """
+    change = np.eye(len(covariance.matrix))
+    spans = parameter_slices(cameras)
+    turned = [_turned_twist(camera.cam_from_world) for camera in cameras]
+    for span, twist in zip(spans, turned, strict=True):
+        # A world that is off by delta sees the camera off by -Ad(cam_from_world) delta.
+        change[span.start : span.start + POSE] -= twist @ world_by_parameter
+    matrix = change @ covariance.matrix @ change.T
+    for span, twist in zip(spans, turned, strict=True):
+        for other, other_twist in zip(spans, turned, strict=True):
+            matrix[span.start : span.start + POSE, other.start : other.start + POSE] += (
+                twist @ world_covariance @ other_twist.T
+            )
+    return RigCovariance(covariance.labels, (matrix + matrix.T) / 2.0)
+
+
+def _turned_twist(b_from_a: Pose) -> NDArray[np.float64]:
+    """Return the matrix (6, 6) that takes (omega, v) in frame a to frame b (the adjoint)."""
+    rotation, (x, y, z) = b_from_a[:, :3], b_from_a[:, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    zero = np.zeros((3, 3))
+    return np.block([[rotation, zero], [cross @ rotation, rotation]])
+
+
 # --- In images and in space -------------------------------------------------------------------
 
 
-def parameter_slices(rig: Rig) -> list[slice]:
-    """Return where each camera's parameters stand in the covariance."""
-    ends = np.cumsum([POSE + len(camera.params) for camera in rig.cameras])
+def parameter_slices(cameras: Sequence[Camera]) -> list[slice]:
+    """Return where each camera's parameters stand in the covariance of a rig."""
+    ends = np.cumsum([POSE + len(camera.params) for camera in cameras])
     return [
         slice(int(end) - POSE - len(camera.params), int(end))
-        for end, camera in zip(ends, rig.cameras, strict=True)
+        for end, camera in zip(ends, cameras, strict=True)
     ]
 
 
@@ -299,7 +342,7 @@ def point_gains(
     n_seeing : (N,) int
         Cameras that do.
     """
-    n_points, slices = len(points_world), parameter_slices(rig)
+    n_points, slices = len(points_world), parameter_slices(rig.cameras)
     information = np.zeros((n_points, 3, 3))
     moments = np.zeros((n_points, 3, slices[-1].stop))
     n_seeing = np.zeros(n_points, dtype=np.intp)
@@ -336,7 +379,7 @@ def pixel_covariance(rig: Rig, points_world: NDArray[np.float64]) -> NDArray[np.
     ValueError
         If the rig has no covariance.
     """
-    matrix, slices = _matrix(rig), parameter_slices(rig)
+    matrix, slices = _matrix(rig), parameter_slices(rig.cameras)
     n_cameras = len(rig.cameras)
     derivatives = [image_derivatives(camera, points_world)[1] for camera in rig.cameras]
     found = np.zeros((len(points_world), n_cameras, 2, n_cameras, 2))

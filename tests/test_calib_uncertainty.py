@@ -1,14 +1,16 @@
 """What a rig's covariance claims is what happens, over many calibrations of known rigs."""
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
+from helpers.boards import observe_exactly, ring
 from helpers.bundles import BOARD, make_bundle
 from numpy.typing import NDArray
 
 from hybridve.calib.bundle import Adjusted, adjust, moved_pose
+from hybridve.calib.calibrate import CalibrationSettings, solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import project_points
 from hybridve.calib.pose import Pose, compose, invert
@@ -23,6 +25,7 @@ from hybridve.calib.uncertainty import (
     radius95,
     rig_covariance,
 )
+from hybridve.calib.world import Mark
 
 NOISE_PX = 0.3
 N_SEEDS = 25
@@ -120,7 +123,7 @@ def test_gains_predict_how_a_point_moves_with_each_parameter() -> None:
     point = BOARD.center_board[None] + [[0.1, -0.05, 0.2]]
     gains, n_seeing = point_gains(rig, point)
     assert n_seeing == [3]
-    for index, span in enumerate(parameter_slices(rig)):
+    for index, span in enumerate(parameter_slices(rig.cameras)):
         camera = rig.cameras[index]
         scales = np.concatenate([np.full(6, 1e-5), 1e-5 * np.abs(camera.params)])
         for column, step in enumerate(scales):
@@ -153,7 +156,7 @@ def test_the_pixel_covariance_is_that_of_the_images_of_disturbed_rigs() -> None:
     for _ in range(4000):
         change = factor @ rng.normal(size=len(factor))
         pixels = []
-        for camera, span in zip(rig.cameras, parameter_slices(rig), strict=True):
+        for camera, span in zip(rig.cameras, parameter_slices(rig.cameras), strict=True):
             other = replace(
                 camera,
                 cam_from_world=moved_pose(camera.cam_from_world, change[span][:6]),
@@ -239,3 +242,56 @@ def test_a_point_that_one_camera_sees_has_no_place() -> None:
 
     assert told.n_seeing[0] < 2
     assert np.isnan(told.radius95_m[0])
+
+
+def test_a_world_found_by_the_cameras_shares_their_errors() -> None:
+    """Points whose places are known define the world: errors of poses in it, over many seeds."""
+    true = ring(BOARD, ["PINHOLE"] * 3)
+    places = np.array([[0.0, 0.0, 0.0], [0.9, 0.1, 0.0], [0.1, 0.8, 0.05], [0.5, 0.4, 0.4]])
+    settings_of = partial(CalibrationSettings, world="points")
+    squares, count = 0.0, 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        marks = tuple(
+            Mark(
+                f"p{number}",
+                {
+                    camera.name: tuple(
+                        project_points(camera, place[None])[0][0] + rng.normal(0.0, 0.5, 2)
+                    )
+                    for camera in true
+                },
+                place,
+            )
+            for number, place in enumerate(places)
+        )
+        seen = [
+            replace(
+                observed,
+                sightings=tuple(
+                    replace(
+                        sighting,
+                        pixels=sighting.pixels + rng.normal(0.0, 0.3, sighting.pixels.shape),
+                    )
+                    for sighting in observed.sightings
+                ),
+            )
+            for observed in observe_exactly(BOARD, true, n_stills=8)
+        ]
+        rig = solve_rig([BOARD], seen, settings_of(marks=marks)).rig
+        assert rig.covariance is not None
+        spans = parameter_slices(rig.cameras)
+        columns = np.concatenate([np.arange(span.start, span.start + 6) for span in spans])
+        matrix = rig.covariance.matrix[np.ix_(columns, columns)]
+        errors = np.concatenate(
+            [
+                pose_error(camera.cam_from_world, found.cam_from_world)
+                for camera, found in zip(true, rig.cameras, strict=True)
+            ]
+        )
+        scale = np.sqrt(np.diag(matrix))
+        scaled = np.linalg.inv(matrix / np.outer(scale, scale))
+        squares += float((errors / scale) @ scaled @ (errors / scale))
+        count += len(errors)
+
+    assert squares / count == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / count) + 0.05)

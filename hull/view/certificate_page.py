@@ -417,7 +417,9 @@ def _parameters(rig: Rig, certificate: Certificate) -> str:
     deviations = np.sqrt(np.diag(rig.covariance.matrix))
     labels = rig.covariance.labels
     parts = ["<h2>Parameters</h2>"]
-    for index, (camera, span) in enumerate(zip(rig.cameras, parameter_slices(rig), strict=True)):
+    for index, (camera, span) in enumerate(
+        zip(rig.cameras, parameter_slices(rig.cameras), strict=True)
+    ):
         told = certificate.cameras[index]
         rows = []
         names = parameter_names(camera.model)
