@@ -67,6 +67,8 @@ class BundleView:
         Its points in pixels, pixel centre at 0.5; NaN where not seen.
     image : str
         For messages.
+    sigma_px : float
+        Standard deviation of a coordinate by which its points are weighed.
     """
 
     camera: int
@@ -74,6 +76,7 @@ class BundleView:
     board: int
     pixels: NDArray[np.float64]
     image: str
+    sigma_px: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,8 +127,9 @@ class Adjusted:
     residuals_px : tuple of (N, 2) float64
         Observed minus projected points of each view; NaN where not seen.
     information : (A, A) float64
-        Of the adjusted parameters of cameras, lenses and boards, for noise of one pixel: the normal
-        matrix without the bodies' poses, in the columns of `layout`.
+        Of the adjusted parameters of cameras, lenses and boards, for points as noisy as their views
+        say (`BundleView.sigma_px`): the normal matrix without the bodies' poses, in the columns of
+        `layout`.
     layout : Layout
         Which column is what.
     n_steps : int
@@ -203,7 +207,7 @@ def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
     seen = [is_seen(view.pixels) for view in bundle.views]
     residuals = _residuals(bundle, seen)
     n_seen = sum(map(len, residuals))
-    cost = _cost(residuals, loss_px)
+    cost = _cost(bundle, residuals, loss_px)
     if not np.isfinite(cost):
         lost = next(
             view.image
@@ -221,7 +225,7 @@ def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
         step = _solve(normal, damping)
         moved = _moved(bundle, layout, step)
         moved_residuals = _residuals(moved, seen)
-        moved_cost = _cost(moved_residuals, loss_px)
+        moved_cost = _cost(bundle, moved_residuals, loss_px)
         is_small = _largest(step, normal) < _STEP_TOLERANCE
         if moved_cost <= cost:  # False for NaN
             gain = cost - moved_cost
@@ -274,12 +278,15 @@ def _cam_from_board(bundle: Bundle, view: BundleView) -> Pose:
     return compose(bundle.cameras[view.camera].cam_from_world, rig_from_board)
 
 
-def _cost(residuals: Sequence[NDArray[np.float64]], loss_px: float) -> float:
-    """Return the robust sum of squares; NaN where a seen point has no image."""
+def _cost(bundle: Bundle, residuals: Sequence[NDArray[np.float64]], loss_px: float) -> float:
+    """Return the robust sum of squares, weighed; NaN where a seen point has no image."""
     squares = (np.concatenate(residuals) ** 2).sum(axis=1)
     if np.isfinite(loss_px):
         squares = 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
-    return float(squares.sum())
+    weights = np.repeat(
+        [view.sigma_px**-2 for view in bundle.views], [len(missed) for missed in residuals]
+    )
+    return float(weights @ squares)
 
 
 # --- One step ---------------------------------------------------------------------------------
@@ -337,7 +344,7 @@ def _normal_equations(
             columns.append(board)
         points_rig = transform(bundle.rig_from_body[view.pose], points_body)
         pose = _by_pose(by_point @ camera.cam_from_world[:, :3], points_rig)
-        jacobian = np.concatenate([*blocks, pose, missed[:, :, None]], axis=2)
+        jacobian = np.concatenate([*blocks, pose, missed[:, :, None]], axis=2) / view.sigma_px
         if np.isfinite(loss_px):  # the weights of the soft L1
             weights = (1.0 + (missed**2).sum(axis=1) / loss_px**2) ** -0.25
             jacobian = jacobian * weights[:, None, None]

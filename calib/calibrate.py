@@ -42,6 +42,7 @@ from hybridve.calib.uncertainty import (
     Noise,
     camera_parameter_names,
     in_world,
+    measure_group_noise,
     measure_noise,
     parameter_slices,
     rig_covariance,
@@ -67,8 +68,8 @@ _WRONG_CLIP_PX = 5.0
 #: not determined.
 _TILT_FACTOR = 1.5
 
-#: A point may lie outside its image by this share of the longer side, not further.
-_BEYOND = 0.02
+#: Points that lie outside the image (found there, or marked): a larger share is a mistake.
+_OUTSIDE = 0.1
 
 #: Cameras do not agree where the clip misses the rig by so many times what it misses their lenses
 #: alone, and by more than this. The camera is named whose pairs with the others differ so many
@@ -81,6 +82,9 @@ _ODD_FACTOR = 2.0
 #: rig's parameters, pixels of clicks) by which derivatives of the world are taken.
 _CLICK_PX = 0.5
 _WORLD_STEP = 1e-2
+
+#: Points are taken to be no less noisy than this.
+_LEAST_SIGMA_PX = 1e-6
 
 #: Outliers that are listed one by one.
 _TOLD_OUTLIERS = 50
@@ -269,14 +273,16 @@ def _check(boards: Sequence[Board], observations: Sequence[Observations]) -> Non
                     f"camera {seen.name!r}: {sighting.image} has {len(sighting.pixels)} points, "
                     f"expected the {n_points} of {boards[sighting.board]}"
                 )
-            beyond_px = np.maximum(-sighting.pixels, sighting.pixels - seen.size_px)
-            if np.nanmax(beyond_px, initial=0.0) > _BEYOND * max(seen.size_px):
-                raise CalibrationError(
-                    "camera {!r}: {} has points outside an image of {}x{} pixels; were stills, "
-                    "clip and corners recorded in the same mode?".format(
-                        seen.name, sighting.image, *seen.size_px
-                    )
+        pixels = np.concatenate([np.zeros((0, 2)), *(s.pixels for s in seen.sightings)])
+        pixels = pixels[is_seen(pixels)]
+        outside = ((pixels < 0) | (pixels > seen.size_px)).any(axis=1)
+        if outside.sum() > _OUTSIDE * len(pixels):
+            raise CalibrationError(
+                "camera {!r}: {} of {} points lie outside its images of {}x{} pixels; were stills, "
+                "clip and corners recorded in the same mode?".format(
+                    seen.name, outside.sum(), len(pixels), *seen.size_px
                 )
+            )
 
 
 # --- Lenses and clocks ------------------------------------------------------------------------
@@ -391,7 +397,8 @@ def _solve_fixed(
         linked, warnings=(*linked.warnings, *_disagreeing(boards, lenses, linked, rough))
     )
     cleaned, outliers = _without_outliers(rough)
-    adjusted = adjust(cleaned)
+    adjusted, noise, groups = _adjust_weighed(cleaned, linked)
+    about["noise_by_group"] = {name: asdict(told) for name, told in groups.items()}
     placed = place_world(
         settings.world,
         adjusted.bundle.cameras,
@@ -402,12 +409,11 @@ def _solve_fixed(
     for warning in placed.diagnostics["warnings"]:
         logger.warning("%s", warning)
     rig_from_world = invert(placed.world_from_rig)
-    noise = measure_noise(adjusted)
     in_the_world = tuple(
         replace(camera, cam_from_world=_rigid(compose(camera.cam_from_world, rig_from_world)))
         for camera in adjusted.bundle.cameras
     )
-    covariance = rig_covariance(adjusted, noise.smooth_px)
+    covariance = rig_covariance(adjusted, 1.0)
     if settings.world != "board":
         # The board is held, and so without error; a world found by the cameras shares theirs.
         covariance = in_world(
@@ -418,6 +424,32 @@ def _solve_fixed(
     return _Solved(
         adjusted, linked, noise, in_the_world, covariance, placed.world_from_rig, outliers
     )
+
+
+def _adjust_weighed(bundle: Bundle, linked: Linked) -> tuple[Adjusted, Noise, dict[str, Noise]]:
+    """Adjust a bundle with each view weighed by the noise of its kind; return that noise, too.
+
+    The clip and the stills of each camera are kinds of their own: a board in hand is blurred where
+    one on the floor, averaged over many frames, is not.
+    """
+    even = adjust(bundle)
+    groups = [
+        "board clip"
+        if isinstance(linked.pose_names[view.pose][0], int)
+        else f"stills of {bundle.cameras[view.camera].name}"
+        for view in bundle.views
+    ]
+    noise, by_group = measure_noise(even), measure_group_noise(even, groups)
+    # Points without noise (generated ones) are weighed alike, and leave no doubt.
+    sigmas_px = [max(by_group[group].smooth_px, _LEAST_SIGMA_PX) for group in groups]
+    weighed = replace(
+        even.bundle,
+        views=tuple(
+            replace(view, sigma_px=sigma_px)
+            for view, sigma_px in zip(even.bundle.views, sigmas_px, strict=True)
+        ),
+    )
+    return adjust(weighed), noise, by_group
 
 
 def _world_errors(
@@ -551,9 +583,7 @@ def _disagreeing(
         key=lambda index: missed_px[index] / max(lenses[index].rms_px, _DISAGREES_PX),
     )
     alone_px = lenses[worst].rms_px
-    if not lenses[worst].views or missed_px[worst] < _DISAGREES_FACTOR * max(
-        alone_px, _DISAGREES_PX
-    ):
+    if missed_px[worst] < _DISAGREES_FACTOR * max(alone_px, _DISAGREES_PX):
         return []
     odd = _odd_one_out(boards, linked, rough.bundle)
     who = "the cameras do" if odd is None else f"camera {lenses[odd].camera.name!r} does"
@@ -683,7 +713,9 @@ def _mount(
 ) -> _Mounted:
     world_from_board = None if solved is None else _still_boards(boards, seen, solved)
     mount, told = mount_camera(lens.camera, boards, seen.sightings, track, world_from_board)
-    return _Mounted(lens.camera, mount, told)
+    # A moving camera stands in the rig where it was in the middle of its clip.
+    middle = mount.cam_from_world(track[told["middle_instant"]])
+    return _Mounted(replace(lens.camera, cam_from_world=middle), mount, told)
 
 
 def _still_boards(

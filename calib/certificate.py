@@ -43,8 +43,10 @@ _SHARE = 0.95
 #: Cells across and down an image in which coverage is counted.
 _CELLS = (8, 6)
 
-#: An image is unsure where its points are known less well than this, in pixels at 95 %.
+#: An image is unsure where its points are known less well than this, in pixels at 95 %, and so many
+#: times less well than in the median of the image.
 _UNSURE_PX = 1.0
+_UNSURE_FACTOR = 3.0
 
 #: Places across and down an image at which that is asked.
 _IMAGE_PLACES = 9
@@ -454,7 +456,8 @@ def _undetermined(
     """Return the parameters of a lens whose errors make its image unsure, worst first."""
     (camera,) = alone.cameras
     assert alone.covariance is not None
-    if not np.isfinite(edge_px).any() or np.nanmax(edge_px) <= _UNSURE_PX:
+    known = edge_px[np.isfinite(edge_px)]
+    if not len(known) or known.max() <= max(_UNSURE_PX, _UNSURE_FACTOR * np.median(known)):
         return ()
     worst = _image_points(camera, pixels[[int(np.nanargmax(edge_px))]], volume)
     derivatives = image_derivatives(camera, worst)[1][0]  # (2, 6 + P)

@@ -10,8 +10,8 @@ synthesis*, 2000 (section 9); Hartley and Zisserman, *Multiple View Geometry*, 2
 (sections 5.1 and 5.2, error of estimation and propagation of covariance).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from hybridve.calib.board import is_seen
-from hybridve.calib.bundle import POSE, Adjusted, lens_derivatives
+from hybridve.calib.bundle import POSE, Adjusted, Bundle, lens_derivatives
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, img_from_cam, parameter_names
 from hybridve.calib.pose import Pose, transform
@@ -27,6 +27,11 @@ from hybridve.calib.rig import Rig, RigCovariance
 
 #: What is smooth over a board: polynomials in its coordinates up to this degree.
 _SMOOTH_DEGREE = 3
+
+#: The smooth part of residuals is a misfit, or a group of views noisier or quieter than others, if
+#: its mean square is larger, or other, by so many standard deviations of what chance does.
+_MISFIT_SIGMAS = 2.0
+_GROUP_SIGMAS = 3.0
 
 #: Weak knowledge of what no picture told, as standard deviations: a rotation (radians), a place
 #: (metres), and by its share a focal length or, by the image's width, a principal point; the
@@ -78,35 +83,124 @@ class Noise:
 
 def measure_noise(adjusted: Adjusted) -> Noise:
     """Return how noisy the points of an adjusted bundle were."""
-    bundle = adjusted.bundle
-    smooth_squares = rough_squares = 0.0
-    n_smooth = n_rough = n_points = 0
-    for view, missed in zip(bundle.views, adjusted.residuals_px, strict=True):
+    return _group_sums(adjusted, [""] * len(adjusted.bundle.views))[""].noise()
+
+
+def measure_group_noise(adjusted: Adjusted, groups: Sequence[str]) -> dict[str, Noise]:
+    """Return how noisy the points of groups of views were.
+
+    Parameters
+    ----------
+    adjusted : Adjusted
+        The bundle after its adjustment.
+    groups : sequence of str
+        For each view of the bundle its group; views of one pose should be of one.
+
+    Returns
+    -------
+    dict of str to Noise
+        By group. A group whose noise differs from that of all views by no more than chance allows
+        (`_GROUP_SIGMAS`) is told with that of all.
+    """
+    whole = measure_noise(adjusted)
+    found = {}
+    for name, sums in _group_sums(adjusted, groups).items():
+        own = sums.noise()
+        left = sums.n_smooth - sums.n_parameters
+        ratio = (own.smooth_px / whole.smooth_px) ** 2 if whole.smooth_px > 0 else 1.0
+        chance = _GROUP_SIGMAS * np.sqrt(2.0 / left) if left > 0 else np.inf
+        if not abs(ratio - 1.0) > chance:
+            own = replace(own, rough_px=whole.rough_px, smooth_px=whole.smooth_px)
+        found[name] = own
+    return found
+
+
+@dataclass(slots=True)
+class _Sums:
+    """Squares of residuals, smooth and rough, and how many numbers they stand for."""
+
+    smooth: float = 0.0
+    rough: float = 0.0
+    n_smooth: int = 0
+    n_rough: int = 0
+    n_points: int = 0
+    n_parameters: float = 0.0
+
+    def noise(self) -> Noise:
+        total, freedom = self.smooth + self.rough, 2 * self.n_points - self.n_parameters
+        pooled = total / max(1.0, freedom)
+        rough = self.rough / self.n_rough if self.n_rough else pooled
+        # The parameters have taken their share of what is smooth. What chance explains is no
+        # misfit of model or boards.
+        left = self.n_smooth - self.n_parameters
+        smooth = self.smooth / left if left > self.n_smooth / 10 else pooled
+        if smooth < rough * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / max(1.0, left))):
+            smooth = rough = pooled
+        expected = rough * max(1.0, freedom)
+        return Noise(
+            float(np.sqrt(rough)),
+            float(np.sqrt(smooth)),
+            float(np.sqrt(total / max(1, self.n_points))),
+            min(1.0, float(expected / total)) if total > 0 else 1.0,
+            self.n_points,
+            round(self.n_parameters),
+        )
+
+
+def _group_sums(adjusted: Adjusted, groups: Sequence[str]) -> dict[str, _Sums]:
+    bundle, layout = adjusted.bundle, adjusted.layout
+    sums: dict[str, _Sums] = {}
+    of_lens: dict[int, dict[str, int]] = {}
+    of_camera: dict[int, dict[str, int]] = {}
+    of_pose: dict[int, str] = {}
+    for view, missed, group in zip(bundle.views, adjusted.residuals_px, groups, strict=True):
         seen = is_seen(view.pixels)
         points, rows = bundle.points_board[view.board][seen, :2], missed[seen]
         basis = _smooth_basis(points)
         fitted = basis @ (basis.T @ rows)
-        smooth_squares += float((fitted**2).sum())
-        rough_squares += float(((rows - fitted) ** 2).sum())
-        n_smooth += 2 * basis.shape[1]
-        n_rough += 2 * (len(rows) - basis.shape[1])
-        n_points += len(rows)
-    n_parameters = adjusted.layout.size + POSE * (len(bundle.rig_from_body) - 1)
-    total = smooth_squares + rough_squares
-    pooled = total / max(1, 2 * n_points - n_parameters)
-    rough = rough_squares / n_rough if n_rough else pooled
-    # The parameters have taken their share of what is smooth.
-    left = n_smooth - n_parameters
-    smooth = max(smooth_squares / left, rough) if left > n_smooth / 10 else max(pooled, rough)
-    expected = rough * max(1, 2 * n_points - n_parameters)
-    return Noise(
-        float(np.sqrt(rough)),
-        float(np.sqrt(smooth)),
-        float(np.sqrt(total / max(1, n_points))),
-        min(1.0, expected / total) if total > 0 else 1.0,
-        n_points,
-        n_parameters,
-    )
+        own = sums.setdefault(group, _Sums())
+        own.smooth += float((fitted**2).sum())
+        own.rough += float(((rows - fitted) ** 2).sum())
+        own.n_smooth += 2 * basis.shape[1]
+        own.n_rough += 2 * (len(rows) - basis.shape[1])
+        own.n_points += len(rows)
+        if view.pose not in of_pose and view.pose != bundle.held_pose:
+            own.n_parameters += POSE
+        of_pose[view.pose] = group
+        lens = bundle.lens_of[view.camera]
+        for table, key in ((of_lens, lens), (of_camera, view.camera)):
+            counts = table.setdefault(key, {})
+            counts[group] = counts.get(group, 0) + 2 * basis.shape[1]
+    # A lens is told by all of its views. A camera's place is told by the poses that others saw,
+    # too; a still of one camera alone says nothing of it.
+    shared = _shared_groups(bundle, groups)
+    for lens, counts in of_lens.items():
+        if lens in layout.of_lens:
+            span = layout.of_lens[lens]
+            _share_out(sums, counts, span.stop - span.start)
+    for counts in of_camera.values():
+        told = {group: count for group, count in counts.items() if group in shared}
+        _share_out(sums, told or counts, POSE)
+    _share_out(sums, dict.fromkeys(shared or sums, 1), POSE * len(layout.of_board))
+    return sums
+
+
+def _shared_groups(bundle: Bundle, groups: Sequence[str]) -> set[str]:
+    """Return the groups with a pose that tells where cameras are."""
+    cameras: dict[int, set[int]] = {}
+    for view in bundle.views:
+        cameras.setdefault(view.pose, set()).add(view.camera)
+    return {
+        group
+        for view, group in zip(bundle.views, groups, strict=True)
+        if len(cameras[view.pose]) > 1 or view.pose == bundle.held_pose
+    }
+
+
+def _share_out(sums: dict[str, _Sums], counts: Mapping[str, int], n_parameters: int) -> None:
+    total = sum(counts.values())
+    for group, count in counts.items():
+        sums[group].n_parameters += n_parameters * count / total
 
 
 def _smooth_basis(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -127,7 +221,8 @@ def rig_covariance(adjusted: Adjusted, sigma_px: float) -> RigCovariance:
     adjusted : Adjusted
         After `hybridve.calib.bundle.adjust`; its held pose is the world.
     sigma_px : float
-        Standard deviation of a coordinate of a point, pixels.
+        Standard deviation of a coordinate of a point, pixels; 1 if the views were weighed by
+        theirs (`BundleView.sigma_px`).
     """
     bundle, layout = adjusted.bundle, adjusted.layout
     prior = np.zeros(layout.size)
