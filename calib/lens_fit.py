@@ -848,6 +848,12 @@ def fit_shared_lens(
     fit = fit_batch(seen, batch, settings, fixed_params)
     if fixed_params is None:
         refuse_degenerate(seen, batch, fit)
+    elif 2 * fit.kept.sum() < len(views):
+        raise CalibrationError(
+            f"{who(seen)}: the lens that was given (`params`) fits only {fit.kept.sum()} of "
+            f"{len(views)} views of the board; are they this camera's, for this image size, in the "
+            f"order of COLMAP's {seen[0].model}, and is the board as described?"
+        )
     return share_out(boards, seen, views, unusable, batch, fit, fixed_params is None)
 
 
@@ -895,6 +901,8 @@ def collect_views(
     if is_free and len(views) < settings.min_views:
         n_missed = len(unusable) + sum(len(camera.missed) for camera in seen)
         found = f"in {len(views)} of {len(views) + n_missed} pictures"
+        if unusable:
+            found += f" ({len(unusable)} others show too little of it)"
         if not views and not n_missed and any(camera.sightings for camera in seen):
             found = "only lying still in the clip that all cameras see"
         raise CalibrationError(
