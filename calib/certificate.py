@@ -190,6 +190,9 @@ class Certificate:
         What limits the error most; None where it is NaN.
     warnings : tuple of str
         What a person should look at.
+    doubts : tuple of str
+        Those among them that make the stated errors void: what the pictures show contradicts itself
+        or leaves the rig open. A quality gate must not pass such a rig.
     """
 
     verdict: str
@@ -203,6 +206,7 @@ class Certificate:
     cameras: tuple[CameraCertificate, ...]
     limit: Limit | None
     warnings: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain JSON values; NaN becomes None."""
@@ -304,9 +308,12 @@ def certify(rig: Rig, seen: Mapping[str, SeenPoints], noise: Noise, volume: Volu
         _certify_camera(rig, index, seen.get(camera.name), volume)
         for index, camera in enumerate(rig.cameras)
     )
-    warnings = _warnings(rig, cameras, noise)
+    doubts = _doubts(rig)
+    verdict = _verdict(error95_m, cameras, limit)
+    if doubts:
+        verdict = f"not to be trusted: {doubts[0]} Without this doubt: {verdict}"
     return Certificate(
-        verdict=_verdict(error95_m, cameras, limit),
+        verdict=verdict,
         error95_m=error95_m,
         median_error95_m=float(np.median(errors_m)) if has_errors else np.nan,
         largest_error95_m=float(errors_m.max()) if has_errors else np.nan,
@@ -316,7 +323,8 @@ def certify(rig: Rig, seen: Mapping[str, SeenPoints], noise: Noise, volume: Volu
         noise=noise,
         cameras=cameras,
         limit=limit,
-        warnings=warnings,
+        warnings=doubts + _warnings(rig, cameras, noise),
+        doubts=doubts,
     )
 
 
@@ -491,7 +499,20 @@ def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> t
         )
     if len(rig.cameras) == 1:
         warnings.append("one camera alone places no point in space: no error in mm is stated")
+    warnings += rig.provenance.get("world", {}).get("warnings", [])
     return tuple(warnings)
+
+
+def _doubts(rig: Rig) -> tuple[str, ...]:
+    """Return what a calibration found to contradict itself, or could not decide."""
+    doubts = list(rig.provenance.get("adjustment", {}).get("warnings", []))
+    if rig.provenance.get("labelling", {}).get("is_weak", False):
+        doubts.append(
+            "the board looks the same when turned, and hardly anything tells which way round each "
+            "camera saw it; mark the corners by hand in one order, move the board, or use one with "
+            "an odd sum of columns and rows."
+        )
+    return tuple(doubts)
 
 
 def _kind(parameter: str) -> str:

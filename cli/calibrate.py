@@ -269,7 +269,7 @@ def _write_certificate(
 
 def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
     """Leave with a status of its own if the error is not proved to be small enough."""
-    error_m = math.nan if certificate is None else certificate.error95_m
+    error_m = math.nan if certificate is None or certificate.doubts else certificate.error95_m
     if error_m <= max_error_m:
         return
     found = f"{1000 * error_m:.2g} mm" if math.isfinite(error_m) else "an unknown error"

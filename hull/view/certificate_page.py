@@ -170,10 +170,12 @@ def write_certificate_page(
 def state_of(certificate: Certificate, max_error_m: float | None = None) -> State:
     """Return how good a rig is at first sight.
 
-    Refused: its error is more than `max_error_m`, or there is none to state though it has several
-    cameras, or though one is asked for. Limits: it comes with warnings.
+    Refused: there are doubts about it, its error is more than `max_error_m`, or there is none to
+    state though it has several cameras, or though one is asked for. Limits: it comes with warnings.
     """
     is_known = math.isfinite(certificate.error95_m)
+    if certificate.doubts:
+        return "refused"
     if max_error_m is not None and not certificate.error95_m <= max_error_m:
         return "refused"
     if not is_known and len(certificate.cameras) > 1:
