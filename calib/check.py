@@ -47,9 +47,18 @@ from hybridve.calib.rig import Rig
 SCALE_TOLERANCE = 0.05
 REPROJECTION_TOLERANCE = 0.01
 
+#: So do images that, each camera for itself, show a focal length that differs by more than this
+#: share, and by so many standard deviations.
+ZOOM_TOLERANCE = 0.05
+_ZOOM_SIGMAS = 4.0
+
 #: With a covariance: a rig is accused if what it shows happens in less than this share of rigs
 #: that have not been touched; each camera's part in it alone, or all of it together.
 SIGNIFICANCE = 0.01
+
+#: Where a rig is known to be wrong, the rest of its cameras agree unless this is how rare they are:
+#: what chance does to them must not hide who was moved.
+_REST_SIGNIFICANCE = 1e-4
 
 #: The squares of a board are known to this share, by a ruler: a smaller scale is told, not blamed.
 _SQUARES_KNOWN = 0.005
@@ -498,8 +507,14 @@ class _Case:
         everything = self.state_of(everyone)
         if self._drop_outliers(everything):
             everything = self.state_of(everyone, everything)
+        zooms = self._own_zooms() if self.rig.covariance is None else {}
+        if len(everyone) == 2 and zooms:
+            zoomed = {index: self._lens_only(everything, index) for index in zooms}
+            return _Finding(self, everything, everything, zoomed, (), self.untested)
         state = everything
-        aside: list[int] = []
+        aside = list(zooms) if len(everyone) - len(zooms) > 1 else []
+        if aside:
+            state = self.state_of(tuple(i for i in everyone if i not in aside), everything)
         suspects: tuple[int, ...] = ()
         while not state.agrees and not suspects:
             if len(state.cameras) == 2:
@@ -516,13 +531,37 @@ class _Case:
             suspects = () if zoomed else suspects
             return _Finding(self, everything, everything, zoomed, suspects, self.untested)
         # Who was set aside for another's fault comes back.
-        for index in list(aside) if len(aside) > 1 else []:
+        back = [index for index in aside if index not in zooms]
+        for index in back if len(aside) > 1 else []:
             again = self.state_of(tuple(sorted((*state.cameras, index))), everything)
             if again.agrees:
                 aside.remove(index)
                 state = again
         moved = {index: self._moved(index, state, everything) for index in sorted(aside)}
         return _Finding(self, state, everything, moved, (), self.untested)
+
+    def _own_zooms(self) -> dict[int, float]:
+        """Return the cameras whose own images contradict their focal length, and by what factor.
+
+        Each view has a board of its own here: no camera speaks for another.
+        """
+        n_views = len(self.table.place)
+        views = replace(self.table, place=np.arange(n_views))
+        at_origin = tuple(replace(c, cam_from_world=np.eye(3, 4)) for c in self.rig.cameras)
+        start = Placed(at_origin, self.cam_from_middle, 1.0)
+        as_stated = place_boards(views, start, scaled=False, loss_px=self.loss_px)
+        everyone = range(len(self.names))
+        found = place_boards(views, as_stated, (), everyone, scaled=False, loss_px=self.loss_px)
+        before, after = residuals_of(views, as_stated), residuals_of(views, found)
+        zooms = {}
+        for index, (stated, zoomed) in enumerate(zip(self.rig.cameras, found.cameras, strict=True)):
+            own = views.camera == index
+            gain = float(np.nansum(before[own] ** 2) - np.nansum(after[own] ** 2))
+            variance = _variance(views, after, [index])
+            factor = float(zoomed.pinhole[0, 0] / stated.pinhole[0, 0])
+            if abs(np.log(factor)) > ZOOM_TOLERANCE and gain > _ZOOM_SIGMAS**2 * variance:
+                zooms[index] = factor
+        return zooms
 
     def _drop_outliers(self, state: _State) -> bool:
         """Forget single points that miss although cameras may stand anywhere; tell if any did."""
@@ -546,12 +585,11 @@ class _Case:
             odds = {index: state.alone[index] - state.alone[worst[0]] for index in worst}
             guilty = [index for index in worst if odds[index] < _CLEAR_ODDS]
             return tuple(sorted(guilty)) if len(guilty) > 1 else ()
+        least = max(state.alone[worst[0]], float(POSE * len(state.cameras)))
+        if state.alone[worst[1]] > _CLEAR_FACTOR**2 * least:
+            return ()
         other = self.state_of(_less(state.cameras, worst[1]), state)
-        if other.agrees and max(other.rms_px.values()) < _CLEAR_FACTOR * max(
-            without.rms_px.values()
-        ):
-            return tuple(sorted(worst[:2]))
-        return ()
+        return tuple(sorted(worst[:2])) if other.agrees else ()
 
     def state_of(self, cameras: tuple[int, ...], before: _State | None = None) -> _State:
         """Return what the boards that some cameras saw together say of these."""
@@ -654,6 +692,7 @@ class _Case:
         p_alone = {i: chance_of(max(statistic - alone[i], 0.0), POSE) for i in cameras}
         if n_cameras > 2:  # the whole, and each camera: the least of these probabilities
             p_value = min(1.0, 2.0 * p_value, 2.0 * n_cameras * min(p_alone.values()))
+        allowed = SIGNIFICANCE if n_cameras == len(self.names) else _REST_SIGNIFICANCE
         within = all(rms_px[index] <= self.limits_px[index] for index in cameras)
         return _State(
             cameras,
@@ -665,7 +704,7 @@ class _Case:
             p_value,
             whole.log_scale,
             whole.log_scale_sigma,
-            within if covariance is None else p_value >= SIGNIFICANCE,
+            within if covariance is None else p_value >= allowed,
         )
 
     def _apart(self, cameras: tuple[int, ...]) -> _State:
@@ -735,6 +774,14 @@ class _Case:
             rms(residuals_of(views, at_stated)[mine]),
             p_value,
         )
+
+    def _lens_only(self, state: _State, index: int) -> Moved:
+        """Return by what factor a camera's focal length differs, the poses being as stated."""
+        fit = place_boards(self.table, state.placed, (), [index], loss_px=self.loss_px)
+        factor = fit.cameras[index].pinhole[0, 0] / self.rig.cameras[index].pinhole[0, 0]
+        missed = residuals_of(self.table, replace(fit, cameras=self.rig.cameras))
+        missed_px = rms(missed[self.table.camera == index])
+        return Moved("lens", 0.0, 0.0, float(factor), missed_px, None)
 
     def _zoomed(self, state: _State) -> dict[int, Moved]:
         """Return which of two cameras a change of its focal length explains, if of one."""
@@ -1077,8 +1124,10 @@ class _Comparison:
         turned = np.array([self.today[index].center_world for index in held]) @ rotation.T
         if scale is None:
             # By their distances: they tell it even where cameras stand elsewhere altogether.
-            spread, spread_today = np.std(centers, axis=0), np.std(turned, axis=0)
-            scale = float(np.linalg.norm(spread) / max(np.linalg.norm(spread_today), 1e-12))
+            spread, spread_today = (
+                float(np.linalg.norm(np.std(places, axis=0))) for places in (centers, turned)
+            )
+            scale = spread / max(spread_today, 1e-12)
             scale = scale if len(held) > 1 and scale > 0 else 1.0
         return _Similarity(rotation, centers.mean(axis=0) - scale * turned.mean(axis=0), scale)
 

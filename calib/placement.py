@@ -35,6 +35,9 @@ _LEAST_DAMPING = 1e-12
 _MOST_DAMPING = 1e9
 _MAX_STEPS = 60
 
+#: A step changes the logarithm of a scale or focal length by this at most.
+_LARGEST_CHANGE = 1.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
@@ -180,7 +183,7 @@ def place_boards(
             system = _System(views, now, residuals, moving, zooming, scaled, loss_px)
         trial = system.step(now, damping)
         trial_residuals = residuals_of(views, trial)
-        trial_cost = _cost(trial_residuals, loss_px) if trial.scale > 0 else np.inf
+        trial_cost = _cost(trial_residuals, loss_px)
         if trial_cost < cost:
             gain = cost - trial_cost
             now, residuals, cost, system = trial, trial_residuals, trial_cost, None
@@ -280,10 +283,13 @@ class _System:
             cameras[index] = replace(cameras[index], cam_from_world=pose)
         first = POSE * len(self.moving)
         for number, index in enumerate(self.zooming):
-            cameras[index] = zoomed(cameras[index], float(np.exp(shared[first + number])))
-        scale = placed.scale * float(np.exp(np.clip(shared[-1], -3, 3))) if self.scaled else None
+            change = np.clip(shared[first + number], -_LARGEST_CHANGE, _LARGEST_CHANGE)
+            cameras[index] = zoomed(cameras[index], float(np.exp(change)))
+        scale = placed.scale
+        if self.scaled:
+            scale *= float(np.exp(np.clip(shared[-1], -_LARGEST_CHANGE, _LARGEST_CHANGE)))
         boards = _turned(placed.boards, moves)
-        return Placed(tuple(cameras), boards, placed.scale if scale is None else scale)
+        return Placed(tuple(cameras), boards, scale)
 
 
 def _turned(boards: NDArray[np.float64], moves: NDArray[np.float64]) -> NDArray[np.float64]:
