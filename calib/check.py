@@ -9,12 +9,10 @@ agree best, until the rest agrees.
 Where the rig knows its own errors (its covariance), these and the noise of the corners say how
 large a disagreement may be; else fixed tolerances do.
 
-This work is based on: Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., 2003 (sections 5.1
-and 5.2, error of estimation and propagation of covariance); Koch, *Parameter estimation and
-hypothesis testing in linear models*, 2nd ed., 1999 (section 4.5, tests for single shifts).
+This work is based on: Koch, *Parameter estimation and hypothesis testing in linear models*, 2nd
+ed., 1999 (section 4.5, tests for single shifts).
 """
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +24,13 @@ from numpy.typing import NDArray
 from hybridve.calib.board import Board, Sighting, is_seen
 from hybridve.calib.bundle import POSE
 from hybridve.calib.camera import Camera
+from hybridve.calib.comparison import (
+    LEAST_NOISE_PX,
+    Comparison,
+    chance_of,
+    root_of,
+    variance_of,
+)
 from hybridve.calib.consensus import common_pose
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
@@ -36,7 +41,6 @@ from hybridve.calib.placement import (
     information_of,
     place_boards,
     residuals_of,
-    solve_scaled,
 )
 from hybridve.calib.pose import Pose, angle_between, compose, invert, transform
 from hybridve.calib.rig import Rig
@@ -73,9 +77,6 @@ _CLEAR_FACTOR = 3.0
 #: Placements that are used of each two cameras, at least if there are as many: more change nothing.
 _PAIR_PLACEMENTS = 40
 
-#: Corners are at least this noisy.
-_LEAST_NOISE_PX = 0.05
-
 #: A corner that misses by more than both is an outlier, if not more than a share of its view are.
 _OUTLIER_SIGMAS = 6.0
 _OUTLIER_PX = 3.0
@@ -88,12 +89,6 @@ _LOSS_ALONE = 3.0
 #: Cameras let free that miss by more than so many times what each alone does are not yet placed.
 _CLOSE_FACTOR = 1.5
 
-#: What is smooth over a board: polynomials up to this degree. It counts as repeated from view to
-#: view, a lens or board that is not quite as modelled, where it exceeds the noise of single points
-#: by more than this many standard deviations.
-_SMOOTH_DEGREE = 3
-_EXCESS_SIGMAS = 3.0
-
 #: Two cameras are tried in each other's place where the rig misses by more than so many times
 #: REPROJECTION_TOLERANCE, on so many placements.
 _EXCHANGE_TOLERANCES = 3.0
@@ -103,12 +98,6 @@ _MAX_EXCHANGES = 28
 
 #: Points of a view from which it is told which camera places its board best, about.
 _PROPOSAL_POINTS = 12
-
-#: The scale of a comparison of two rigs: steps at most, when they are small enough (a share), and
-#: that of differences.
-_MAX_TURNS = 12
-_SCALE_CONVERGED = 1e-7
-_STEP = 1e-5
 
 #: A focal length explains a camera where it leaves less than this share of what another pose does.
 _EXPLAINS = 0.5
@@ -557,7 +546,7 @@ class _Case:
         for index, (stated, zoomed) in enumerate(zip(self.rig.cameras, found.cameras, strict=True)):
             own = views.camera == index
             gain = float(np.nansum(before[own] ** 2) - np.nansum(after[own] ** 2))
-            variance = _variance(views, after, [index])
+            variance = variance_of(views, after, [index])
             factor = float(zoomed.pinhole[0, 0] / stated.pinhole[0, 0])
             if abs(np.log(factor)) > ZOOM_TOLERANCE and gain > _ZOOM_SIGMAS**2 * variance:
                 zooms[index] = factor
@@ -624,7 +613,7 @@ class _Case:
         loss_px = self.loss_px
         best = place_boards(views, starts[0], cameras[1:], scaled=False, loss_px=loss_px)
         left_px = _typical_px(residuals_of(views, best))
-        if left_px > _CLOSE_FACTOR * self.alone_px + _LEAST_NOISE_PX:
+        if left_px > _CLOSE_FACTOR * self.alone_px + LEAST_NOISE_PX:
             chained = self._chained(cameras, views, poses)
             other = place_boards(views, chained, cameras[1:], scaled=False, loss_px=loss_px)
             if _typical_px(residuals_of(views, other)) < left_px:
@@ -670,16 +659,16 @@ class _Case:
     ) -> _State:
         """Return how far cameras as the boards show them are from where the rig has them."""
         information, gradient, spans = information_of(views, today)
-        variance = _variance(views, residuals_of(views, today), cameras)
+        variance = variance_of(views, residuals_of(views, today), cameras)
         covariance = self.rig.covariance
-        comparison = _Comparison(
+        comparison = Comparison(
             self.rig.cameras,
             today.cameras,
             cameras,
             spans,
             information / variance,
             gradient / variance,
-            np.zeros((len(information), 0)) if covariance is None else _root(covariance.matrix),
+            np.zeros((len(information), 0)) if covariance is None else root_of(covariance.matrix),
         )
         least = comparison.disagreement(cameras).cost
         whole = comparison.disagreement(())
@@ -921,229 +910,14 @@ def _explanation(left_px: Mapping[str, float], n_values: int) -> str:
     """
     unknowns = {"pose": POSE, "lens": 1}
     score = {
-        what: n_values * np.log(left_px[what] ** 2 + _LEAST_NOISE_PX**2) + count * np.log(n_values)
+        what: n_values * np.log(left_px[what] ** 2 + LEAST_NOISE_PX**2) + count * np.log(n_values)
         for what, count in unknowns.items()
     }
     best = min(sorted(score, reverse=True), key=lambda what: score[what])
     both = left_px.get("pose and lens", np.inf)
-    if both**2 + _LEAST_NOISE_PX**2 < _EXPLAINS * (left_px[best] ** 2 + _LEAST_NOISE_PX**2):
+    if both**2 + LEAST_NOISE_PX**2 < _EXPLAINS * (left_px[best] ** 2 + LEAST_NOISE_PX**2):
         return "pose and lens"
     return best
-
-
-# --- The statistics ---------------------------------------------------------------------------
-
-
-def chance_of(statistic: float, freedom: int) -> float:
-    """Return how often chi-squared with so many degrees of freedom is larger.
-
-    Parameters
-    ----------
-    statistic : float
-        The value of chi-squared, at least 0.
-    freedom : int
-        Degrees of freedom; with none, nothing is ever larger.
-
-    Examples
-    --------
-    >>> round(chance_of(3.841459, 1), 4), round(chance_of(12.591587, 6), 4)
-    (0.05, 0.05)
-    """
-    if freedom <= 0:
-        return 1.0
-    half = statistic / 2.0
-    # Abramowitz and Stegun, 26.4.4 and 26.4.5.
-    chance = math.erfc(math.sqrt(half)) if freedom % 2 else math.exp(-half)
-    for order in range(2 - freedom % 2, freedom, 2):
-        if half > 0:
-            chance += math.exp(order / 2.0 * math.log(half) - half - math.lgamma(order / 2.0 + 1.0))
-    return min(1.0, chance)
-
-
-def _variance(views: Views, residuals: NDArray[np.float64], cameras: Sequence[int]) -> float:
-    """Return the variance of a coordinate that disagreement is compared with, pixels squared.
-
-    That of what is smooth over the boards, by which poses are moved, and at least that of single
-    points. Smooth misses beyond the noise repeat from view to view, and do not average out.
-    """
-    n_seen = views.seen.sum(axis=1)
-    shared = np.bincount(views.place)
-    found = []
-    for index in cameras:
-        own = np.flatnonzero((views.camera == index) & (n_seen > 0))
-        smooth = rough = 0.0
-        n_smooth, n_rough = 0, 0
-        for number in own:
-            seen = views.seen[number]
-            basis = _smooth_basis(views.points[number, seen, :2])
-            rows = residuals[number, seen]
-            fitted = basis @ (basis.T @ rows)
-            smooth += float((fitted**2).sum())
-            rough += float(((rows - fitted) ** 2).sum())
-            n_smooth += 2 * basis.shape[1]
-            n_rough += 2 * (len(rows) - basis.shape[1])
-        # The camera's pose, and its part of those of the boards, have taken their share.
-        taken = POSE + POSE * float((1.0 / shared[views.place[own]]).sum())
-        left = max(n_smooth - taken, 1.0)
-        of_rough = rough / n_rough if n_rough > 0 else 0.0
-        of_smooth = smooth / left if n_smooth > 1.1 * taken else of_rough
-        chance = 1.0 + _EXCESS_SIGMAS * math.sqrt(2.0 / left)
-        excess = max(0.0, of_smooth - of_rough * chance) if n_rough else 0.0
-        found.append(max(of_rough, of_smooth) + excess * (len(own) - 1))
-    return max(float(np.median(found)), _LEAST_NOISE_PX**2)
-
-
-def _smooth_basis(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return an orthonormal basis (S, K) of the smooth functions over points (S, 2) of a board."""
-    centred = points - points.mean(axis=0)
-    x, y = (centred / max(float(np.abs(centred).max()), 1e-12)).T
-    powers = range(_SMOOTH_DEGREE + 1)
-    terms = [x**i * y**j for i in powers for j in powers if i + j <= _SMOOTH_DEGREE]
-    u, values, _ = np.linalg.svd(np.column_stack(terms), full_matrices=False)
-    return np.asarray(u[:, values > 1e-9 * values[0]])
-
-
-def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return L (P, K) with ``L @ L.T`` the covariance, which may be singular."""
-    sigma = np.sqrt(np.diag(covariance))
-    sigma[sigma == 0] = 1.0
-    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
-    return np.asarray(sigma[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Similarity:
-    """Where today's world stands in the rig's: ``x_rig = scale * rotation @ x_today + shift``."""
-
-    rotation: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    scale: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Disagreement:
-    """Squared, in units of its variance, up to a constant; and the scale at which it is least."""
-
-    cost: float
-    log_scale: float
-    log_scale_sigma: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Comparison:
-    """A rig as it is stated, and as boards show some of its cameras today.
-
-    Attributes
-    ----------
-    stated, today : tuple of Camera
-        Cameras in the rig's world, and in one of their own at true scale.
-    cameras : tuple of int
-        Those that are compared.
-    spans : sequence of slice
-        Their parameters' columns.
-    information : (P, P) float64
-        What the boards tell of the parameters, at true scale.
-    gradient : (P,) float64
-        Half the derivative of the squared misses by these.
-    root : (P, K) float64
-        Of the covariance of the stated parameters; no column where they count as exact.
-    """
-
-    stated: tuple[Camera, ...]
-    today: tuple[Camera, ...]
-    cameras: tuple[int, ...]
-    spans: Sequence[slice]
-    information: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    root: NDArray[np.float64]
-
-    def disagreement(self, loose: Sequence[int]) -> _Disagreement:
-        """Return how far the cameras disagree, some of them let loose.
-
-        Unknown are the errors of the rig, which its covariance holds back, its scale, and the poses
-        of loose cameras. Where today's world is in the rig's makes no difference to first order:
-        the boards, wherever they are, do not tell. It is taken from the cameras that are held.
-        """
-        held = [index for index in self.cameras if index not in loose]
-        is_scaled = len(held) > 1
-        similarity = self._nearest(held or list(self.cameras))
-        free = [self.spans[index].start + k for index in loose for k in range(POSE)]
-        loosened = np.zeros((len(self.information), len(free)))
-        loosened[free, range(len(free))] = 1.0
-        n_root = self.root.shape[1]
-        cost, log_sigma = np.inf, np.inf
-        for _ in range(_MAX_TURNS):
-            off = self._off(similarity)
-            errors = self.root.copy()
-            for index in self.cameras:
-                first = self.spans[index].start
-                errors[first + 3 : first + POSE] /= similarity.scale
-            larger, smaller = (
-                self._off(self._nearest(held or list(self.cameras), similarity.scale * factor))
-                for factor in (np.exp(_STEP), np.exp(-_STEP))
-            )
-            by_scale = (larger - smaller)[:, None] / (2.0 * _STEP) * is_scaled
-            design = np.concatenate([errors, loosened, -by_scale], axis=1)
-            normal = design.T @ self.information @ design
-            normal[range(n_root), range(n_root)] += 1.0
-            right = design.T @ (self.information @ off - self.gradient)
-            solution, inverse = solve_scaled(normal, right)
-            left = design @ solution - off
-            cost = float(left @ self.information @ left + 2.0 * self.gradient @ left)
-            cost += float((solution[:n_root] ** 2).sum())
-            log_sigma = float(np.sqrt(max(inverse[-1, -1], 0.0)))
-            change = float(np.clip(solution[-1], -1.0, 1.0))
-            if not is_scaled or abs(change) < _SCALE_CONVERGED:
-                break
-            similarity = self._nearest(held, similarity.scale * math.exp(change))
-        return _Disagreement(cost, math.log(similarity.scale), log_sigma)
-
-    def _off(self, similarity: _Similarity) -> NDArray[np.float64]:
-        """Return by how much (P,) today's poses are off the stated ones, at true scale."""
-        off = np.zeros(len(self.information))
-        for index in self.cameras:
-            today, stated = self.today[index].cam_from_world, self.stated[index].cam_from_world
-            rotation = today[:, :3] @ similarity.rotation.T
-            shift = similarity.scale * today[:, 3] - rotation @ similarity.shift
-            relative = rotation @ stated[:, :3].T
-            first = self.spans[index].start
-            off[first : first + 3] = _turn_of(relative)
-            off[first + 3 : first + POSE] = (shift - relative @ stated[:, 3]) / similarity.scale
-        return off
-
-    def _nearest(self, held: Sequence[int], scale: float | None = None) -> _Similarity:
-        """Return the similarity that takes cameras onto the stated ones, in closed form."""
-        together = sum(
-            self.stated[index].cam_from_world[:, :3].T @ self.today[index].cam_from_world[:, :3]
-            for index in held
-        )
-        u, _, vt = np.linalg.svd(together)
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        centers = np.array([self.stated[index].center_world for index in held])
-        turned = np.array([self.today[index].center_world for index in held]) @ rotation.T
-        if scale is None:
-            # By their distances: they tell it even where cameras stand elsewhere altogether.
-            spread, spread_today = (
-                float(np.linalg.norm(np.std(places, axis=0))) for places in (centers, turned)
-            )
-            scale = spread / max(spread_today, 1e-12)
-            scale = scale if len(held) > 1 and scale > 0 else 1.0
-        return _Similarity(rotation, centers.mean(axis=0) - scale * turned.mean(axis=0), scale)
-
-
-def _turn_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation vector (3,) of a rotation."""
-    axis = 0.5 * np.array(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
-    sine = float(np.linalg.norm(axis))
-    angle = math.atan2(sine, 0.5 * (float(np.trace(rotation)) - 1.0))
-    return axis * (angle / sine if sine > 1e-12 else 1.0)
 
 
 # --- The verdict ------------------------------------------------------------------------------

@@ -14,7 +14,8 @@ from helpers.bundles import make_bundle
 from hybridve.calib.board import Sighting
 from hybridve.calib.bundle import adjust, moved_pose
 from hybridve.calib.camera import Camera
-from hybridve.calib.check import SCALE_TOLERANCE, SIGNIFICANCE, RigCheck, chance_of, check_rig
+from hybridve.calib.check import SCALE_TOLERANCE, SIGNIFICANCE, RigCheck, check_rig
+from hybridve.calib.comparison import chance_of
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placement import zoomed
 from hybridve.calib.pose import compose, rotation_about_axes
