@@ -19,7 +19,7 @@ synthesis*, 2000; Nocedal and Wright, *Numerical optimization*, 2nd ed., 2006, c
 (Levenberg and Marquardt); Barfoot, *State estimation for robotics*, 2017, chapter 7 (poses).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +29,7 @@ from hybridve.calib.board import is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.pose import Pose, compose, transform
+from hybridve.calib.pose import Pose, transform
 
 #: Parameters of a pose.
 POSE = 6
@@ -204,34 +204,34 @@ def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
         If the start values project points to nowhere.
     """
     layout = make_layout(bundle)
-    seen = [is_seen(view.pixels) for view in bundle.views]
-    residuals = _residuals(bundle, seen)
+    groups = _groups(bundle)
+    residuals = _residuals(bundle, groups)
     n_seen = sum(map(len, residuals))
-    cost = _cost(bundle, residuals, loss_px)
+    cost = _cost(groups, residuals, loss_px)
     if not np.isfinite(cost):
         lost = next(
             view.image
-            for view, missed in zip(bundle.views, residuals, strict=True)
-            if not np.isfinite(missed).all()
+            for view, missed in zip(bundle.views, _by_view(bundle, groups, residuals), strict=True)
+            if not np.isfinite(missed[is_seen(view.pixels)]).all()
         )
         raise CalibrationError(
             f"the joint adjustment cannot start: its lens does not see the board in {lost}"
         )
     damping = _FIRST_DAMPING
-    normal = _normal_equations(bundle, layout, seen, residuals, loss_px)
+    normal = _normal_equations(bundle, layout, groups, residuals, loss_px)
     n_steps = 0
     while n_steps < _MAX_STEPS and damping < _MOST_DAMPING:
         n_steps += 1
         step = _solve(normal, damping)
         moved = _moved(bundle, layout, step)
-        moved_residuals = _residuals(moved, seen)
-        moved_cost = _cost(bundle, moved_residuals, loss_px)
+        moved_residuals = _residuals(moved, groups)
+        moved_cost = _cost(groups, moved_residuals, loss_px)
         is_small = _largest(step, normal) < _STEP_TOLERANCE
         if moved_cost <= cost:  # False for NaN
             gain = cost - moved_cost
             bundle, residuals, cost = moved, moved_residuals, moved_cost
             damping = max(damping / 10.0, _LEAST_DAMPING)
-            normal = _normal_equations(bundle, layout, seen, residuals, loss_px)
+            normal = _normal_equations(bundle, layout, groups, residuals, loss_px)
             if is_small or gain <= _COST_TOLERANCE * cost + n_seen * _COST_FLOOR_PX**2:
                 break
         elif is_small:
@@ -239,54 +239,105 @@ def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
         else:
             damping *= 10.0
     return Adjusted(
-        bundle,
-        tuple(_spread(missed, where) for missed, where in zip(residuals, seen, strict=True)),
-        _reduced(normal, 0.0)[0],
-        layout,
-        n_steps,
+        bundle, _by_view(bundle, groups, residuals), _reduced(normal, 0.0)[0], layout, n_steps
     )
 
 
 def view_residuals(bundle: Bundle) -> tuple[NDArray[np.float64], ...]:
     """Return observed minus projected points (N, 2) of each view, pixels; NaN where not seen."""
-    seen = [is_seen(view.pixels) for view in bundle.views]
-    return tuple(
-        _spread(missed, where) for missed, where in zip(_residuals(bundle, seen), seen, strict=True)
-    )
+    groups = _groups(bundle)
+    return _by_view(bundle, groups, _residuals(bundle, groups))
 
 
-def _spread(rows: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return rows (S, 2) of what was seen at their places (N, 2), NaN elsewhere."""
-    every = np.full((len(seen), 2), np.nan)
-    every[seen] = rows
+# --- Points, many at once ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """All that one camera saw of one board: S points of V views."""
+
+    camera: int
+    board: int
+    poses: NDArray[np.intp]  # (V,) in the bundle
+    view: NDArray[np.intp]  # (S,) of each point its view in the bundle, ...
+    member: NDArray[np.intp]  # (S,) ... and in this group
+    point: NDArray[np.intp]  # (S,) of the board
+    pixels: NDArray[np.float64]  # (S, 2)
+    sigma_px: NDArray[np.float64]  # (S,)
+
+
+def _groups(bundle: Bundle) -> list[_Group]:
+    members: dict[tuple[int, int], list[int]] = {}
+    for number, view in enumerate(bundle.views):
+        members.setdefault((view.camera, view.board), []).append(number)
+    groups = []
+    for (camera, board), numbers in sorted(members.items()):
+        pixels = np.array([bundle.views[number].pixels for number in numbers])  # (V, N, 2)
+        member, point = np.nonzero(np.isfinite(pixels).all(axis=2))
+        groups.append(
+            _Group(
+                camera,
+                board,
+                np.array([bundle.views[number].pose for number in numbers]),
+                np.array(numbers)[member],
+                member,
+                point,
+                pixels[member, point],
+                np.array([bundle.views[number].sigma_px for number in numbers])[member],
+            )
+        )
+    return groups
+
+
+def _by_view(
+    bundle: Bundle, groups: Sequence[_Group], rows: Sequence[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], ...]:
+    """Return rows (S, 2) of what was seen in each group by view (N, 2), NaN elsewhere."""
+    every = tuple(np.full(view.pixels.shape, np.nan) for view in bundle.views)
+    for group, own in zip(groups, rows, strict=True):
+        ends = np.flatnonzero(np.diff(group.member)) + 1
+        for view, point, row in zip(
+            np.split(group.view, ends),
+            np.split(group.point, ends),
+            np.split(own, ends),
+            strict=True,
+        ):
+            if len(view):
+                every[view[0]][point] = row
     return every
 
 
-def _residuals(bundle: Bundle, seen: Sequence[NDArray[np.bool_]]) -> list[NDArray[np.float64]]:
-    """Return observed minus projected points (S, 2) of what was seen in each view, pixels."""
-    points_cam = _points_cam(bundle, seen)
-    residuals = [view.pixels[where] for view, where in zip(bundle.views, seen, strict=True)]
-    for camera, own, ends in _by_camera(bundle, points_cam):
-        projected = img_from_cam(camera, np.concatenate([points_cam[number] for number in own]))
-        for number, pixels in zip(own, np.split(projected, ends), strict=True):
-            residuals[number] = residuals[number] - pixels
-    return residuals
+def _points_of(
+    bundle: Bundle, group: _Group
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return a group's points (S, 3) in the frames of body, rig and camera."""
+    points_board = bundle.points_board[group.board]
+    points_body = transform(bundle.body_from_board[group.board], points_board)[group.point]
+    rig_from_body = np.array([bundle.rig_from_body[pose] for pose in group.poses])[group.member]
+    points_rig = (rig_from_body[:, :, :3] @ points_body[:, :, None])[..., 0] + rig_from_body[..., 3]
+    return (
+        points_body,
+        points_rig,
+        transform(bundle.cameras[group.camera].cam_from_world, points_rig),
+    )
 
 
-def _cam_from_board(bundle: Bundle, view: BundleView) -> Pose:
-    rig_from_board = compose(bundle.rig_from_body[view.pose], bundle.body_from_board[view.board])
-    return compose(bundle.cameras[view.camera].cam_from_world, rig_from_board)
+def _residuals(bundle: Bundle, groups: Sequence[_Group]) -> list[NDArray[np.float64]]:
+    """Return observed minus projected points (S, 2) of each group, pixels."""
+    return [
+        group.pixels - img_from_cam(bundle.cameras[group.camera], _points_of(bundle, group)[2])
+        for group in groups
+    ]
 
 
-def _cost(bundle: Bundle, residuals: Sequence[NDArray[np.float64]], loss_px: float) -> float:
+def _cost(
+    groups: Sequence[_Group], residuals: Sequence[NDArray[np.float64]], loss_px: float
+) -> float:
     """Return the robust sum of squares, weighed; NaN where a seen point has no image."""
     squares = (np.concatenate(residuals) ** 2).sum(axis=1)
     if np.isfinite(loss_px):
         squares = 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
-    weights = np.repeat(
-        [view.sigma_px**-2 for view in bundle.views], [len(missed) for missed in residuals]
-    )
-    return float(weights @ squares)
+    return float(np.concatenate([group.sigma_px**-2.0 for group in groups]) @ squares)
 
 
 # --- One step ---------------------------------------------------------------------------------
@@ -312,7 +363,7 @@ class _Step:
 def _normal_equations(
     bundle: Bundle,
     layout: Layout,
-    seen: Sequence[NDArray[np.bool_]],
+    groups: Sequence[_Group],
     residuals: Sequence[NDArray[np.float64]],
     loss_px: float,
 ) -> _Normal:
@@ -324,78 +375,66 @@ def _normal_equations(
         np.zeros((n_poses, POSE)),
         np.zeros((n_poses, POSE, layout.size)),
     )
-    derivatives = _view_derivatives(bundle, seen)
-    for view, where, missed, (points_cam, by_point, by_parameter) in zip(
-        bundle.views, seen, residuals, derivatives, strict=True
-    ):
-        camera = bundle.cameras[view.camera]
-        points = bundle.points_board[view.board][where]
-        blocks = [_by_pose(by_point, points_cam)]
-        columns = [layout.of_camera[view.camera]]
-        lens = layout.of_lens.get(bundle.lens_of[view.camera])
-        if lens is not None:
-            blocks.append(by_parameter)
-            columns.append(lens)
-        points_body = transform(bundle.body_from_board[view.board], points)
-        cam_from_body = compose(camera.cam_from_world, bundle.rig_from_body[view.pose])
-        board = layout.of_board.get(view.board)
-        if board is not None:
-            blocks.append(_by_pose(by_point @ cam_from_body[:, :3], points_body))
-            columns.append(board)
-        points_rig = transform(bundle.rig_from_body[view.pose], points_body)
-        pose = _by_pose(by_point @ camera.cam_from_world[:, :3], points_rig)
-        jacobian = np.concatenate([*blocks, pose, missed[:, :, None]], axis=2) / view.sigma_px
+    for group, missed in zip(groups, residuals, strict=True):
+        jacobian, columns = _jacobian(bundle, layout, group)
+        weights = 1.0 / group.sigma_px
         if np.isfinite(loss_px):  # the weights of the soft L1
-            weights = (1.0 + (missed**2).sum(axis=1) / loss_px**2) ** -0.25
-            jacobian = jacobian * weights[:, None, None]
-        jacobian = jacobian.reshape(-1, jacobian.shape[2])
-        gram = jacobian.T @ jacobian
-        index = np.concatenate([np.arange(span.start, span.stop) for span in columns])
-        n = len(index)
-        normal.rest[np.ix_(index, index)] += gram[:n, :n]
-        normal.rest_gradient[index] += gram[:n, -1]
-        if view.pose != bundle.held_pose:
-            normal.poses[view.pose] += gram[n:-1, n:-1]
-            normal.poses_gradient[view.pose] += gram[n:-1, -1]
-            normal.mixed[view.pose][:, index] += gram[n:-1, :n]
-    normal.poses[bundle.held_pose] = np.eye(POSE)
+            weights = weights * (1.0 + (missed**2).sum(axis=1) / loss_px**2) ** -0.25
+        rows = np.concatenate([jacobian, missed[:, :, None]], axis=2) * weights[:, None, None]
+        gram = _grams(rows, group)  # (V, n + 6 + 1, n + 6 + 1)
+        n = len(columns)
+        of_all = gram.sum(axis=0)
+        normal.rest[np.ix_(columns, columns)] += of_all[:n, :n]
+        normal.rest_gradient[columns] += of_all[:n, -1]
+        for pose, own in zip(group.poses, gram, strict=True):
+            normal.poses[pose] += own[n:-1, n:-1]
+            normal.poses_gradient[pose] += own[n:-1, -1]
+            normal.mixed[pose][:, columns] += own[n:-1, :n]
+    held = bundle.held_pose
+    normal.poses[held], normal.poses_gradient[held], normal.mixed[held] = np.eye(POSE), 0.0, 0.0
     return normal
 
 
-def _view_derivatives(
-    bundle: Bundle, seen: Sequence[NDArray[np.bool_]]
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
-    """Return for each view its points (S, 3), camera frame, and `lens_derivatives` there."""
-    points_cam = _points_cam(bundle, seen)
-    found: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = [
-        (points, np.zeros((0, 2, 3)), np.zeros((0, 2, 0))) for points in points_cam
-    ]
-    for camera, own, ends in _by_camera(bundle, points_cam):
-        by_point, by_parameter = lens_derivatives(
-            camera, np.concatenate([points_cam[number] for number in own])
-        )
-        pieces = zip(np.split(by_point, ends), np.split(by_parameter, ends), strict=True)
-        for number, (of_points, of_parameters) in zip(own, pieces, strict=True):
-            found[number] = (points_cam[number], of_points, of_parameters)
-    return found
+def _jacobian(
+    bundle: Bundle, layout: Layout, group: _Group
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return the derivatives of a group's pixels by what is adjusted.
+
+    Returns
+    -------
+    jacobian : (S, 2, n + 6) float64
+        By the parameters that all views share, then by the pose of the body in each.
+    columns : (n,) int
+        Which parameters the former are.
+    """
+    camera = bundle.cameras[group.camera]
+    points_body, points_rig, points_cam = _points_of(bundle, group)
+    by_point, by_parameter = lens_derivatives(camera, points_cam)
+    blocks = [_by_pose(by_point, points_cam)]
+    spans = [layout.of_camera[group.camera]]
+    lens = layout.of_lens.get(bundle.lens_of[group.camera])
+    if lens is not None:
+        blocks.append(by_parameter)
+        spans.append(lens)
+    by_point_rig = by_point @ camera.cam_from_world[:, :3]
+    board = layout.of_board.get(group.board)
+    if board is not None:
+        rig_from_body = np.array([bundle.rig_from_body[pose][:, :3] for pose in group.poses])
+        blocks.append(_by_pose(by_point_rig @ rig_from_body[group.member], points_body))
+        spans.append(board)
+    blocks.append(_by_pose(by_point_rig, points_rig))
+    columns = np.concatenate([np.arange(span.start, span.stop) for span in spans])
+    return np.concatenate(blocks, axis=2), columns
 
 
-def _by_camera(
-    bundle: Bundle, points_cam: Sequence[NDArray[np.float64]]
-) -> Iterator[tuple[Camera, list[int], NDArray[np.intp]]]:
-    """Go through cameras with their views, and where to split what is computed for all at once."""
-    for index, camera in enumerate(bundle.cameras):
-        own = [number for number, view in enumerate(bundle.views) if view.camera == index]
-        if own:
-            yield camera, own, np.cumsum([len(points_cam[number]) for number in own])[:-1]
-
-
-def _points_cam(bundle: Bundle, seen: Sequence[NDArray[np.bool_]]) -> list[NDArray[np.float64]]:
-    """Return the points (S, 3) seen in each view, camera frame."""
-    return [
-        transform(_cam_from_board(bundle, view), bundle.points_board[view.board][where])
-        for view, where in zip(bundle.views, seen, strict=True)
-    ]
+def _grams(rows: NDArray[np.float64], group: _Group) -> NDArray[np.float64]:
+    """Return for each view of a group the sum of products (V, n, n) of its rows (S, 2, n)."""
+    # Views of fewer points are filled up with rows of zeros: one product for all.
+    n_points = int(group.point.max(initial=0)) + 1
+    filled = np.zeros((len(group.poses), n_points, *rows.shape[1:]))
+    filled[group.member, group.point] = rows
+    filled = filled.reshape(len(filled), -1, rows.shape[2])
+    return np.asarray(filled.transpose(0, 2, 1) @ filled)
 
 
 def _by_pose(by_point: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -501,9 +540,13 @@ def _moved(bundle: Bundle, layout: Layout, step: _Step) -> Bundle:
         bundle,
         cameras=tuple(cameras),
         rig_from_body=tuple(
-            pose if index == bundle.held_pose else moved_pose(pose, change)
-            for index, (pose, change) in enumerate(
-                zip(bundle.rig_from_body, step.poses, strict=True)
+            pose if index == bundle.held_pose else moved
+            for index, (pose, moved) in enumerate(
+                zip(
+                    bundle.rig_from_body,
+                    _moved_poses(np.array(bundle.rig_from_body), step.poses),
+                    strict=True,
+                )
             )
         ),
         body_from_board=tuple(
@@ -520,10 +563,20 @@ def moved_pose(pose: Pose, change: NDArray[np.float64]) -> Pose:
 
     To first order ``x + omega x x + v``; the rotation is exact, and freed of rounding.
     """
-    omega, v = change[:3], change[3:]
-    angle = float(np.linalg.norm(omega))
-    axis = omega / angle if angle > 0 else omega
-    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    rotation = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    u, _, vt = np.linalg.svd(rotation @ pose[:, :3])
-    return np.column_stack([u @ vt, rotation @ pose[:, 3] + v])
+    return np.asarray(_moved_poses(pose[None], change[None])[0])
+
+
+def _moved_poses(poses: NDArray[np.float64], changes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return poses (F, 3, 4), each moved by its (omega, v), (F, 6)."""
+    omega, v = changes[:, :3], changes[:, 3:]
+    angle = np.linalg.norm(omega, axis=1)
+    x, y, z = (omega / np.where(angle > 0, angle, 1.0)[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    rotation = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
+    u, _, vt = np.linalg.svd(rotation @ poses[:, :, :3])
+    moved = np.zeros_like(poses)
+    moved[:, :, :3] = u @ vt
+    moved[:, :, 3] = (rotation @ poses[:, :, 3:])[..., 0] + v
+    return moved

@@ -94,6 +94,24 @@ def test_lens_derivatives_predict_small_steps(model: str) -> None:
     np.testing.assert_allclose(2.0 * by_parameter @ change, moved, atol=1e-5)
 
 
+def test_noisier_views_weigh_less_as_their_variance_says() -> None:
+    """Weighing all views by s scales the information by 1 / s^2; noisy ones alone move nothing."""
+    noisy = make_bundle(["PINHOLE", "PINHOLE"], n_stills=6, noise_px=0.3)
+    even = adjust(noisy)
+    weighed = [replace(view, sigma_px=0.5) for view in noisy.views]
+
+    found = adjust(replace(noisy, views=tuple(weighed)))
+
+    np.testing.assert_allclose(found.information, even.information / 0.25, rtol=1e-6)
+    assert_same_cameras(found.bundle, even.bundle)
+    clean = make_bundle(["PINHOLE", "PINHOLE"], n_stills=12)
+    spoilt = [
+        replace(view, pixels=view.pixels + 2.0, sigma_px=1e4) if index % 5 == 2 else view
+        for index, view in enumerate(clean.views)
+    ]
+    assert_same_cameras(adjust(replace(clean, views=tuple(spoilt))).bundle, clean, 1e-6)
+
+
 def test_a_lens_that_is_shared_is_one_lens() -> None:
     truth = make_bundle(["OPENCV"] * 3, n_stills=6, noise_px=0.3)
     shared = replace(truth, lens_of=(0, 0, 1))
