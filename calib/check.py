@@ -74,6 +74,9 @@ _CLEAR_ODDS = 9.0
 #: so many times less without it.
 _CLEAR_FACTOR = 3.0
 
+#: Cameras nearer to one another than this share of their distance from the boards tell no scale.
+_LEAST_BASELINE = 0.01
+
 #: Placements that are used of each two cameras, at least if there are as many: more change nothing.
 _PAIR_PLACEMENTS = 40
 
@@ -139,10 +142,10 @@ class RigCheck:
     ----------
     scale : float
         How many times too large the rig is: the boards' squares as the rig measures them, by the
-        squares as they are.
+        squares as they are. 1 where all cameras stand in one place: it cannot be told.
     pair_scales : dict of str to float
         The same from the distance of each two cameras alone, "cam1 cam2"; they differ where the
-        rig is wrong by more than its scale.
+        rig is wrong by more than its scale. Without those that stand in one place.
     rms_px : dict of str to float
         How far corners lie from where the rig, at the scale found, says: per camera, pixels.
         Boards are placed by the cameras that agree.
@@ -436,6 +439,7 @@ class _Case:
         )
         self.together = self._together()
         self.scale_of_pair = self._scales_of_pairs()
+        self.tells_scale = bool(self.scale_of_pair)
 
     @classmethod
     def of(
@@ -483,11 +487,13 @@ class _Case:
     def _scales_of_pairs(self) -> dict[tuple[int, int], float]:
         centers = self.rig.centers_world
         own = [invert(pose)[:, 3] for pose in self.cam_from_middle]
+        distance_m = float(np.median(np.linalg.norm(self.cam_from_middle[:, :, 3], axis=1)))
         scales = {}
         for (i, j), shared in sorted(self.together.items()):
             by_board = float(np.median([np.linalg.norm(own[a] - own[b]) for a, b in shared]))
             in_rig = float(np.linalg.norm(centers[i] - centers[j]))
-            scales[i, j] = max(in_rig, 1e-12) / max(by_board, 1e-12)
+            if by_board > _LEAST_BASELINE * distance_m and in_rig > 0:
+                scales[i, j] = in_rig / by_board
         return scales
 
     def examine(self) -> _Finding:
@@ -588,10 +594,11 @@ class _Case:
         views, poses = self.table.of(chosen), self.cam_from_middle[chosen]
         scales = [scale for pair, scale in self.scale_of_pair.items() if set(pair) <= set(cameras)]
         stated = self.rig.cameras
-        if not scales:  # no two of them saw one board
+        if not chosen.any():  # no two of them saw one board
             return self._apart(cameras)
-        start = _placed_by(stated, views, poses, len(self.moments), float(np.median(scales)))
-        placed = place_boards(views, start)
+        scale = float(np.median(scales)) if scales else 1.0
+        start = _placed_by(stated, views, poses, len(self.moments), scale)
+        placed = place_boards(views, start, scaled=self.tells_scale)
         residuals = residuals_of(views, placed)
         rms_px = {index: rms(residuals[views.camera == index]) for index in cameras}
         today = self._today(cameras, views, poses, placed if before is None else before.today)
@@ -737,12 +744,18 @@ class _Case:
         mine = views.camera == index
         fits = {
             "pose": place_boards(
-                views, replace(others, cameras=tuple(cameras)), [index], loss_px=self.loss_px
+                views,
+                replace(others, cameras=tuple(cameras)),
+                [index],
+                scaled=self.tells_scale,
+                loss_px=self.loss_px,
             ),
-            "lens": place_boards(views, others, (), [index], loss_px=self.loss_px),
+            "lens": place_boards(
+                views, others, (), [index], scaled=self.tells_scale, loss_px=self.loss_px
+            ),
         }
         fits["pose and lens"] = place_boards(
-            views, fits["pose"], [index], [index], loss_px=self.loss_px
+            views, fits["pose"], [index], [index], scaled=self.tells_scale, loss_px=self.loss_px
         )
         left = {what: rms(residuals_of(views, fit)[mine]) for what, fit in fits.items()}
         what = _explanation(left, 2 * int(views.seen[mine].sum()))
@@ -766,7 +779,9 @@ class _Case:
 
     def _lens_only(self, state: _State, index: int) -> Moved:
         """Return by what factor a camera's focal length differs, the poses being as stated."""
-        fit = place_boards(self.table, state.placed, (), [index], loss_px=self.loss_px)
+        fit = place_boards(
+            self.table, state.placed, (), [index], scaled=self.tells_scale, loss_px=self.loss_px
+        )
         factor = fit.cameras[index].pinhole[0, 0] / self.rig.cameras[index].pinhole[0, 0]
         missed = residuals_of(self.table, replace(fit, cameras=self.rig.cameras))
         missed_px = rms(missed[self.table.camera == index])
@@ -780,7 +795,9 @@ class _Case:
         found: dict[int, tuple[float, Moved]] = {}
         p_value = state.p_value if self.rig.covariance is not None else None
         for index in state.cameras:
-            fit = place_boards(table, state.placed, (), [index], loss_px=self.loss_px)
+            fit = place_boards(
+                table, state.placed, (), [index], scaled=self.tells_scale, loss_px=self.loss_px
+            )
             left = {"pose": rms(free), "lens": rms(residuals_of(table, fit))}
             factor = fit.cameras[index].pinhole[0, 0] / self.rig.cameras[index].pinhole[0, 0]
             if _explanation(left, n_values) == "lens":
@@ -834,11 +851,13 @@ class _Case:
 
     def worst_miss(self) -> float:
         """Return the largest miss of a camera, in shares of what is allowed."""
-        scale = float(np.median(list(self.scale_of_pair.values())))
+        scale = float(np.median(list(self.scale_of_pair.values()))) if self.tells_scale else 1.0
         start = _placed_by(
             self.rig.cameras, self.table, self.cam_from_middle, len(self.moments), scale
         )
-        residuals = residuals_of(self.table, place_boards(self.table, start))
+        residuals = residuals_of(
+            self.table, place_boards(self.table, start, scaled=self.tells_scale)
+        )
         return max(
             rms(residuals[self.table.camera == index]) / float(limit_px)
             for index, limit_px in enumerate(self.limits_px)
@@ -964,11 +983,13 @@ def _read_out(
 def _verdict(check: RigCheck, square_m: float, is_scaled: bool) -> str:
     scales = check.pair_scales.values()
     sigma = f" +- {check.scale_sigma:.3f}" if check.scale_sigma is not None else ""
-    measured = (
-        f"the board's squares measure {check.scale * square_m * 1000:.1f} mm in the rig, "
-        f"{square_m * 1000:g} mm in truth: scale {check.scale:.3f}{sigma} "
-        f"(by pairs of cameras {min(scales):.3f} to {max(scales):.3f})"
-    )
+    measured = "its scale cannot be told: the cameras stand in one place"
+    if scales:
+        measured = (
+            f"the board's squares measure {check.scale * square_m * 1000:.1f} mm in the rig, "
+            f"{square_m * 1000:g} mm in truth: scale {check.scale:.3f}{sigma} "
+            f"(by pairs of cameras {min(scales):.3f} to {max(scales):.3f})"
+        )
     worst = max(check.rms_px, key=lambda name: check.rms_px[name])
     missed = f"its corners are missed by {check.rms_px[worst]:.1f} px in camera {worst!r}"
     untested = f"; not tested: {', '.join(check.untested)}" if check.untested else ""

@@ -125,6 +125,18 @@ def test_two_cameras_that_disagree_are_told_without_blaming_one() -> None:
     assert "one of 'cam1' and 'cam2'" in check.message
 
 
+def test_cameras_in_one_place_tell_no_scale() -> None:
+    first = ring(BOARD, ["PINHOLE"] * 3)[0]
+    turned = moved_pose(first.cam_from_world, np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0]))
+    cameras = [first, replace(first, name="cam2", cam_from_world=turned)]
+
+    check = check_rig(Rig(tuple(cameras)), [BOARD], corners_of(cameras))
+
+    assert check.is_trustworthy
+    assert check.pair_scales == {}
+    assert "cannot be told" in check.message
+
+
 def test_one_camera_cannot_check_a_rig() -> None:
     cameras = ring(BOARD, ["PINHOLE", "PINHOLE"])
     corners = corners_of(cameras)
