@@ -97,6 +97,7 @@ _CLOSE_FACTOR = 1.5
 _EXCHANGE_TOLERANCES = 3.0
 _EXCHANGE_PLACEMENTS = 6
 
+#: With more pairs of cameras than this, only those that are accused are tried.
 _MAX_EXCHANGES = 28
 
 #: Points of a view from which it is told which camera places its board best, about.
