@@ -18,7 +18,7 @@ generation and detection of highly reliable fiducial markers under occlusion*, P
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -34,6 +34,8 @@ from hybridve.calib.target import (
     move_to_symmetry,
     symmetry_offsets,
 )
+
+_Grey = TypeVar("_Grey", np.uint8, np.float32)
 
 #: The dictionaries of markers, by OpenCV's names.
 DICTIONARIES = tuple(
@@ -78,9 +80,10 @@ _LINK_TOLERANCE_PX = 1.5
 _ANCHORS = 12
 _MARKER_WEIGHT = 1e-4
 
-#: A cell of the frontal view has this many pixels, at most as many as all views together may have.
-_CELL_PX = (20.0, 100.0)
-_VIEWS_PX = 6e6
+#: A cell of the frontal view has this many pixels, those of the image at most twice as many: it is
+#: reduced, and blurred by so many of its pixels as a pixel of the view covers.
+_CELL_PX = (20.0, 50.0)
+_COVER_BLUR = 0.4
 
 #: A point moves at most this far from where it was predicted, in cells.
 _TRAVEL = 0.3
@@ -492,21 +495,34 @@ def _scales(size_px: int, effort: Effort) -> Iterator[tuple[float, bool, bool]]:
     yield from dict.fromkeys(ways)
 
 
-def _scaled(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
+def _scaled(image: NDArray[_Grey], scale: float) -> NDArray[_Grey]:
     if scale == 1.0:
         return image
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    scaled = cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation)
-    return np.asarray(scaled, np.uint8)
+    # OpenCV's fx and fy would not be the ratio of the sizes, which are whole numbers.
+    size = [max(1, round(side * scale)) for side in image.shape[::-1]]
+    return np.asarray(cv2.resize(image, size, interpolation=interpolation), image.dtype)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linked:
-    """Markers that lie as on the board: corners (A, 2) in cells, and in pixels of the image."""
+    """Markers that lie as on the board.
+
+    Attributes
+    ----------
+    plane, pixels : (A, 2) float64
+        Their corners in cells, and in pixels of the image, pixel centre at 0.5.
+    cell_px : float
+        The largest side of a cell in the image.
+    """
 
     plane: NDArray[np.float64]
     pixels: NDArray[np.float64]
     cell_px: float
+
+    def scaled(self, scale: NDArray[np.float64]) -> "_Linked":
+        """Return the same in an image that is `scale` (2,) times as wide and high."""
+        return _Linked(self.plane, self.pixels * scale, self.cell_px * float(scale.mean()))
 
 
 def _read(
@@ -523,39 +539,49 @@ def _read(
             if best is not None:
                 break
             border_bits = pattern.border_bits
-            ids, quads_px = _read_markers(image, dictionary, border_bits)
-        known = np.isin(ids, pattern.ids)
-        most = max(most, int(known.sum()))
-        members = ids[known] - pattern.ids[0]
-        chosen, fitting = _link(pattern, members, quads_px[known])
+            members, quads_px = _read_markers(image, dictionary, pattern)
+        most = max(most, len(members))
+        chosen, fitting = _link(pattern, members, quads_px)
         if len(chosen) >= 2 and (best is None or fitting > best[0]):
-            best = fitting, pattern, members[chosen], quads_px[known][chosen]
+            best = fitting, pattern, members[chosen], quads_px[chosen]
     said = f"{most} markers of the board"
     if best is None:
         if most > 1:
             said += ", which do not lie as on it"
         return None, None, said
     _, pattern, members, found_px = best
-    sides_px = np.linalg.norm(found_px - np.roll(found_px, 1, axis=1), axis=-1)
-    sides = np.linalg.norm(pattern.quads[0, 0] - pattern.quads[0, 1])
-    plane = pattern.quads[members].reshape(-1, 2)
-    pixels = (found_px.reshape(-1, 2) + 0.5) / exact
-    cell_px = float(sides_px.max() / sides / exact.mean())
+    quads, quads_px = pattern.quads[members], (found_px + 0.5) / exact
+    plane, pixels = quads.reshape(-1, 2), quads_px.reshape(-1, 2)
+    sides, sides_px = (
+        np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+        for corners in (quads, quads_px)
+    )
+    cell_px = float((sides_px / sides).max())
     return pattern, _Linked(plane, pixels, cell_px), said
 
 
+@lru_cache(maxsize=16)
+def _own_dictionary(name: str, first_id: int, count: int) -> Any:
+    # Comparing with all markers of a large dictionary takes longer than all other steps. Those of
+    # other boards differ from each of these by more bits than are corrected.
+    whole = _dictionary(name)
+    own = np.ascontiguousarray(whole.bytesList[first_id : first_id + count])
+    return cv2.aruco.Dictionary(own, whole.markerSize, whole.maxCorrectionBits)
+
+
 def _read_markers(
-    image: NDArray[np.uint8], dictionary: str, border_bits: int
+    image: NDArray[np.uint8], dictionary: str, pattern: _Pattern
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the markers in an image: numbers (M,), corners (M, 4, 2) with pixel centres at 0."""
+    """Return the board's markers in an image: indices (M,), corners (M, 4, 2), centres at 0."""
     parameters = cv2.aruco.DetectorParameters()
-    parameters.markerBorderBits = border_bits
+    parameters.markerBorderBits = pattern.border_bits
     parameters.detectInvertedMarker = True
     parameters.minMarkerPerimeterRate = min(0.03, 4 * _MARKER_PX / max(image.shape))
     none = np.zeros(0, np.intp), np.zeros((0, 4, 2))
     if min(image.shape) < 4 * _MARKER_PX:
         return none
-    detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), parameters)
+    own = _own_dictionary(dictionary, int(pattern.ids[0]), len(pattern.ids))
+    detector = cv2.aruco.ArucoDetector(own, parameters)
     found: tuple[Any, ...] = detector.detectMarkers(image)
     corners, ids, _ = found
     if ids is None or len(ids) == 0:
@@ -651,6 +677,19 @@ def _find_points(
     grey: NDArray[np.float32], pattern: _Pattern, linked: _Linked
 ) -> tuple[NDArray[np.float64] | None, bool]:
     """Return points (N, 2), NaN where not seen, and whether black and white are exchanged."""
+    reduced = _scaled(grey, 1.0 / max(1, int(1.2 * linked.cell_px / _CELL_PX[1])))
+    exact = np.array(reduced.shape[::-1]) / grey.shape[::-1]
+    linked = linked.scaled(exact)
+    coarser = linked.cell_px / _CELL_PX[1]
+    if coarser > 1.0:
+        reduced = np.asarray(cv2.GaussianBlur(reduced, (0, 0), _COVER_BLUR * coarser), np.float32)
+    found, inverted = _find_points_in(reduced, pattern, linked)
+    return (None if found is None else found / exact), inverted
+
+
+def _find_points_in(
+    grey: NDArray[np.float32], pattern: _Pattern, linked: _Linked
+) -> tuple[NDArray[np.float64] | None, bool]:
     count = len(pattern.points)
     found = np.full((count, 2), np.nan)
     inverted: bool | None = None
@@ -788,7 +827,6 @@ def _refine(
     known = np.isfinite(found[wanted, 0])
     maps[known, 0] = found[wanted][known]
     cell = float(np.clip(np.ceil(1.2 * linked.cell_px), *_CELL_PX))
-    cell = max(_CELL_PX[0], min(cell, np.floor(np.sqrt(_VIEWS_PX / len(points)) / 2.0)))
     half = int(np.ceil((SYMMETRY_REACH + _TRAVEL) * cell)) + 3
     size = 2 * half + 1
     across = int(np.ceil(np.sqrt(len(points))))

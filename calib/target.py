@@ -475,9 +475,7 @@ def move_to_symmetry(
     reach = SYMMETRY_REACH * cell
     offsets = symmetry_offsets(cell)
     window = np.exp(-0.5 * (offsets / (0.6 * reach)) ** 2).prod(axis=1)
-    window = np.broadcast_to(window, (len(start), len(offsets)))
-    if weights is not None:
-        window = window * weights
+    window = np.tile(window, (len(start), 1)) if weights is None else window * weights
     smooth = cv2.GaussianBlur(view, (0, 0), blur_px)
     slope_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     slope_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
@@ -489,21 +487,25 @@ def move_to_symmetry(
 
     points = start.copy()
     shading = np.zeros((len(points), 2))
+    moving = np.arange(len(points))
     for _ in range(_SYMMETRY_ITERATIONS):
-        ahead, behind = points[:, None] + offsets, points[:, None] - offsets  # (N, K, 2)
+        ahead = points[moving, None] + offsets  # (M, K, 2)
+        behind = points[moving, None] - offsets
         jacobian = np.stack(
             [sample(slope, ahead) - sample(slope, behind) for slope in (slope_x, slope_y)]
             + [np.broadcast_to(offset, ahead.shape[:2]) for offset in offsets.T],
             axis=-1,
-        )  # (N, K, 4)
-        misses = sample(smooth, ahead) - sample(smooth, behind) + shading @ offsets.T
-        normal = np.einsum("nki,nk,nkj->nij", jacobian, window, jacobian) + 1e-3 * np.eye(4)
-        right = np.einsum("nki,nk,nk->ni", jacobian, window, misses)
-        step = -np.linalg.solve(normal, right[..., None])[..., 0]
-        shading += step[:, 2:]
-        length = np.linalg.norm(step[:, :2], axis=1, keepdims=True)
-        points += step[:, :2] * np.minimum(1.0, 0.15 * cell / np.maximum(length, 1e-9))
-        if length.max() < 1e-4 * cell:
+        )  # (M, K, 4)
+        misses = sample(smooth, ahead) - sample(smooth, behind) + shading[moving] @ offsets.T
+        weighted = (jacobian * window[moving, :, None]).transpose(0, 2, 1)
+        normal = weighted @ jacobian + 1e-3 * np.eye(4)
+        step = -np.linalg.solve(normal, weighted @ misses[..., None])[..., 0]
+        shading[moving] += step[:, 2:]
+        length = np.linalg.norm(step[:, :2], axis=1)
+        shorter = np.minimum(1.0, 0.15 * cell / np.maximum(length, 1e-9))
+        points[moving] += step[:, :2] * shorter[:, None]
+        moving = moving[length >= 1e-4 * cell]
+        if len(moving) == 0:
             break
     return points
 
