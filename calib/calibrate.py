@@ -221,8 +221,9 @@ def solve_rig(
     _check(boards, observations)
     report = progress or _no_progress
     requests, tracks = requests or {}, tracks or {}
-    # The rig's numbers must not depend on the order in which cameras are listed.
+    # The rig's numbers must not depend on the order in which cameras and boards are listed.
     ordered = sorted(observations, key=lambda seen: natural_order(seen.name))
+    boards, ordered = _boards_by_name(boards, ordered)
     fixed = [seen for seen in ordered if seen.name not in tracks]
     moving = [seen for seen in ordered if seen.name in tracks]
     about: dict[str, Any] = {}
@@ -283,6 +284,21 @@ def _check(boards: Sequence[Board], observations: Sequence[Observations]) -> Non
                     seen.name, outside.sum(), len(pixels), *seen.size_px
                 )
             )
+
+
+def _boards_by_name(
+    boards: Sequence[Board], observations: Sequence[Observations]
+) -> tuple[list[Board], list[Observations]]:
+    """Return boards in order of name, and the same observations of them."""
+    order = sorted(range(len(boards)), key=lambda index: natural_order(boards[index].name))
+    rank = {index: place for place, index in enumerate(order)}
+    return [boards[index] for index in order], [
+        replace(
+            seen,
+            sightings=tuple(replace(one, board=rank[one.board]) for one in seen.sightings),
+        )
+        for seen in observations
+    ]
 
 
 # --- Lenses and clocks ------------------------------------------------------------------------

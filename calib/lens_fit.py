@@ -914,7 +914,7 @@ def collect_views(
 
 def view_label(boards: Sequence[Board], image: str, board: int) -> str:
     """Return a view's name for messages: its image, and which board if there are several."""
-    return image if len(boards) == 1 else f"{image}, board {board + 1}"
+    return image if len(boards) == 1 else f"{image}, {boards[board].name}"
 
 
 def who(seen: Sequence[Observations]) -> str:
