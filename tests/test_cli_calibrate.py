@@ -1,0 +1,388 @@
+"""``hybridve calibrate`` from end to end, on rendered pictures: files, verdicts, statuses."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers.boards import board_poses, look_at, make_camera, render_board
+from helpers.recorded_boards import held_up
+from numpy.typing import NDArray
+
+from hybridve.calib.camera import Camera
+from hybridve.calib.pose import compose
+from hybridve.calib.rig_io import read_rig
+from hybridve.calib.target import Chessboard
+from hybridve.cli.calibrate import NOT_GOOD_ENOUGH, calibrate
+
+Run = Callable[..., int]
+Captured = pytest.CaptureFixture[str]
+
+#: Rendered boards of few stills place cameras to this, metres.
+PLACED_M = 0.02
+
+SIZE_PX = (320, 240)
+BOARD = Chessboard(7, 6, 0.1)
+HEAD = (
+    'format = "hybridve-session"\nversion = 1\nfps = 25\n[target]\nkind = "chessboard"\n'
+    "columns = 7\nrows = 6\nsquare_mm = 100\n"
+)
+CAMERA = '[[camera]]\nname = "{}"\nmodel = "{}"\nextrinsics = "{}"\n'
+
+
+def around() -> list[Camera]:
+    """Three cameras about a board on the floor, of different focal lengths."""
+    x, y, _ = BOARD.center_board
+    cameras = []
+    for index, (dx, dy, height) in enumerate(
+        [(-0.9, -0.7, 1.0), (0.8, -0.8, 1.1), (0.1, 1.1, 1.2)]
+    ):
+        pose = look_at((x + dx, y + dy, height), (x, y, 0.0))
+        camera = make_camera(f"cam{index + 1}", "SIMPLE_PINHOLE", pose, SIZE_PX)
+        params = camera.params * [1.0 + 0.15 * index, 1.0, 1.0]
+        cameras.append(Camera(camera.name, camera.model, *SIZE_PX, params, camera.cam_from_world))
+    return cameras
+
+
+def bumped(camera: Camera) -> Camera:
+    """Return the camera as it stands after somebody ran into it."""
+    pose = camera.cam_from_world.copy()
+    turn = cv2.Rodrigues(np.array([0.0, 0.05, 0.02]))[0]
+    moved = np.column_stack([turn, [0.03, 0.0, 0.0]])
+    return Camera(camera.name, camera.model, *SIZE_PX, camera.params, compose(moved, pose))
+
+
+def in_front() -> list[Camera]:
+    """Two cameras side by side, before whom a board is moved."""
+    return [
+        make_camera(name, "SIMPLE_PINHOLE", look_at((x, -1.7, 0.1), (x, 0.0, 0.0)), SIZE_PX)
+        for name, x in (("left", 0.0), ("right", 0.25))
+    ]
+
+
+def write(path: Path, image: NDArray[np.uint8]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures: sessions in it share what was found in them."""
+    root = tmp_path_factory.mktemp("recorded")
+    for index, camera in enumerate(around()):
+        folder = root / camera.name
+        for number, pose in enumerate(board_poses(BOARD, 4, index)):
+            write(folder / f"stills/{number}.png", render_board(camera, BOARD, pose, samples=2))
+        picture = render_board(camera, BOARD, samples=2)
+        write(folder / "clip/0.png", picture)
+    write(root / "cam2/bumped/0.png", render_board(bumped(around()[1]), BOARD, samples=2))
+    for number in range(4):
+        still = cv2.imread(str(root / f"cam2/stills/{number}.png"), cv2.IMREAD_GRAYSCALE)
+        write(root / f"cam2/turned/stills/{number}.png", cv2.rotate(still, cv2.ROTATE_180))
+    still = cv2.imread(str(root / "cam2/clip/0.png"), cv2.IMREAD_GRAYSCALE)
+    write(root / "cam2/turned/clip/0.png", cv2.rotate(still, cv2.ROTATE_180))
+    rng = np.random.default_rng(3)
+    for number in range(4):
+        pose = held_up(rng, BOARD, (0.12 + rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.1), 0.05))
+        for camera in in_front():
+            seen = compose(camera.cam_from_world, pose)
+            image = render_board(camera, BOARD, seen, samples=2)
+            write(root / camera.name / f"{number}.png", image)
+            write(root / camera.name / f"mirrored/{number}.png", cv2.flip(image, 1))
+    return root
+
+
+def session(root: Path, name: str, cameras: list[tuple[str, str, str | None]]) -> Path:
+    """Write a session of cameras: name, pattern of the clip, and of the stills."""
+    path = root / f"{name}.toml"
+    text = HEAD
+    for camera, clip, stills in cameras:
+        text += CAMERA.format(camera, "SIMPLE_PINHOLE", clip)
+        text += f'intrinsics = "{stills}"\n' if stills else ""
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def standing(root: Path, name: str = "session", **clips: str) -> Path:
+    """Write the session of the three cameras; some clips may be others."""
+    names = [camera.name for camera in around()]
+    return session(
+        root,
+        name,
+        [(one, f"{clips.get(one, one + '/clip')}/*.png", f"{one}/stills/*.png") for one in names],
+    )
+
+
+@pytest.fixture(scope="module")
+def calibrated(recorded: Path) -> tuple[Path, dict[str, Any], str]:
+    """The folder of a rig, what --json told of it, and what was told on the way."""
+    path, out = standing(recorded), recorded / "rig"
+    ran = CliRunner().invoke(calibrate, [str(path), "--json", "--max-error-mm", "100"])
+    assert ran.exit_code == 0, ran.output
+    return out, json.loads(ran.stdout), ran.stderr
+
+
+def test_the_rig_is_where_the_cameras_stood(calibrated: tuple[Path, dict[str, Any], str]) -> None:
+    rig = read_rig(calibrated[0] / "rig.json")
+
+    assert [camera.name for camera in rig.cameras] == ["cam1", "cam2", "cam3"]
+    for camera in around():
+        off_m = np.linalg.norm(rig[camera.name].center_world - camera.center_world)
+        assert off_m < PLACED_M
+    assert rig.covariance is not None
+
+
+def test_the_certificate_is_the_same_in_all_forms(
+    calibrated: tuple[Path, dict[str, Any], str],
+) -> None:
+    folder, told, _ = calibrated
+    certificate = json.loads((folder / "certificate.json").read_text(encoding="utf-8"))
+    page = (folder / "certificate.html").read_text(encoding="utf-8")
+
+    assert certificate == told["certificate"]
+    assert certificate["verdict"].startswith("good to ")
+    assert 0 < certificate["error95_m"] < 0.1
+    assert certificate["doubts"] == []
+    assert page.count("<img") > 3
+    assert certificate["verdict"].split(";")[0] in page
+    assert told["rig"] == str(folder / "rig.json")
+    assert [one["name"] for one in told["cameras"]] == ["cam1", "cam2", "cam3"]
+
+
+def test_nothing_half_written_stands_beside_the_rig(
+    calibrated: tuple[Path, dict[str, Any], str],
+) -> None:
+    names = {path.name for path in calibrated[0].iterdir()}
+
+    assert names == {"rig.json", "certificate.json", "certificate.html", "colmap", "corners"}
+
+
+def test_a_second_run_reads_no_picture_and_says_the_same(
+    run: Run,
+    capsys: Captured,
+    calibrated: tuple[Path, dict[str, Any], str],
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a board was searched again")
+
+    monkeypatch.setattr(Chessboard, "detect", refuse)
+
+    out = tmp_path / "again"
+    assert run("calibrate", standing(recorded), "-o", out, "--json", "--no-page") == 0
+
+    again = json.loads(capsys.readouterr().out)
+    assert again["certificate"] == calibrated[1]["certificate"]
+    assert not (out / "certificate.html").exists()
+
+
+def test_a_rig_that_exists_is_kept_unless_told(
+    run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
+) -> None:
+    path = calibrated[0] / "rig.json"
+    before = path.read_bytes(), path.stat().st_mtime_ns
+
+    expect_error(run, capsys, "rig.json", "calibrate", standing(recorded), "--no-progress")
+    assert (path.read_bytes(), path.stat().st_mtime_ns) == before
+
+    assert run("calibrate", standing(recorded), "--no-progress", "--overwrite") == 0
+    assert path.stat().st_mtime_ns != before[1]
+    assert read_rig(path)["cam1"].params == pytest.approx(
+        np.array(json.loads(before[0])["cameras"][0]["params"])
+    )
+
+
+def test_the_text_begins_with_the_verdict(
+    run: Run,
+    capsys: Captured,
+    calibrated: tuple[Path, dict[str, Any], str],
+    recorded: Path,
+    tmp_path: Path,
+) -> None:
+    assert run("calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page") == 0
+
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == calibrated[1]["certificate"]["verdict"]
+    assert lines[1] == f"{tmp_path / 'rig' / 'rig.json'}: 3 cameras"
+
+
+def test_a_rig_that_is_not_good_enough_has_a_status_of_its_own(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+) -> None:
+    arguments = ["calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page"]
+
+    assert run(*arguments, "--max-error-mm", "0.001") == NOT_GOOD_ENOUGH == 4
+
+    shown = capsys.readouterr()
+    assert "not to 0.001 mm as --max-error-mm asks" in shown.err
+    assert shown.out.startswith("good to ")
+    assert (tmp_path / "rig" / "rig.json").is_file()
+
+
+def test_the_volume_is_the_one_that_is_asked_for(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+) -> None:
+    box = "0,0,0:600,500,200"
+    arguments = ["calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page", "--json"]
+
+    assert run(*arguments, "--volume-mm", box) == 0
+
+    certificate = json.loads(capsys.readouterr().out)["certificate"]
+    low, high = certificate["volume_low_m"], certificate["volume_high_m"]
+    assert (np.array(low) >= -1e-9).all()
+    assert (np.array(high) <= [0.6 + 1e-9, 0.5 + 1e-9, 0.2 + 1e-9]).all()
+    assert high[2] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--volume-mm", "1,2:3,4"],
+        ["--volume-mm", "10,0,0:0,10,10"],
+        ["--max-error-mm", "0"],
+        ["--rig-unit", "mm"],
+    ],
+)
+def test_wrong_usage_is_status_2(
+    run: Run, recorded: Path, tmp_path: Path, arguments: list[str]
+) -> None:
+    assert run("calibrate", standing(recorded), "-o", tmp_path / "rig", *arguments) == 2
+    assert not (tmp_path / "rig").exists()
+
+
+# --- A rig that is checked ------------------------------------------------------------------
+
+
+def test_a_rig_that_still_fits_passes_its_check(
+    run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
+) -> None:
+    rig = calibrated[0] / "rig.json"
+
+    assert run("calibrate", "--check", rig, standing(recorded), "--no-progress", "--json") == 0
+
+    told = json.loads(capsys.readouterr().out)
+    assert told["is_trustworthy"]
+    assert told["scale"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_camera_that_was_bumped_is_named_with_status_4(
+    run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
+) -> None:
+    rig = calibrated[0] / "rig.json"
+    today = standing(recorded, "today", cam2="cam2/bumped")
+
+    assert run("calibrate", "--check", rig, today, "--no-progress") == NOT_GOOD_ENOUGH
+
+    shown = capsys.readouterr()
+    assert "cam2" in shown.out.splitlines()[0]
+    assert "cam1" not in shown.out.splitlines()[0].replace("cam1.", "")
+
+
+# --- Degenerate recordings ------------------------------------------------------------------
+
+
+def expect_error(run: Run, capsys: Captured, message: str, *arguments: object) -> None:
+    """Assert that a command fails with one line that tells something, and tells nothing else."""
+    assert run(*arguments) == 1
+
+    shown = capsys.readouterr()
+    lines = [line for line in shown.err.splitlines() if not line.startswith("WARNING")]
+    assert len(lines) == 1, shown.err
+    assert lines[0].startswith("error: ")
+    assert message in lines[0]
+    assert shown.out == ""
+
+
+def expect_no_rig(run: Run, capsys: Captured, message: str, path: Path, output: Path) -> None:
+    """Assert that a session gives an error and no rig."""
+    expect_error(run, capsys, message, "calibrate", path, "-o", output, "--no-progress")
+    assert not (output / "rig.json").exists()
+    assert not list(output.glob("certificate*"))
+
+
+def test_one_camera_is_calibrated_and_passes_no_gate(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+) -> None:
+    alone = session(recorded, "alone", [("cam1", "cam1/clip/*.png", "cam1/stills/*.png")])
+    arguments = ["calibrate", alone, "-o", tmp_path / "rig", "--no-progress", "--no-page"]
+
+    assert run(*arguments, "--max-error-mm", "1000") == NOT_GOOD_ENOUGH
+
+    shown = capsys.readouterr()
+    assert "no error in mm can be stated" in shown.out
+    assert "an unknown error" in shown.err
+    off_m = np.linalg.norm(
+        read_rig(tmp_path / "rig" / "rig.json")["cam1"].center_world - around()[0].center_world
+    )
+    assert off_m < PLACED_M
+
+
+def test_a_camera_upside_down_is_placed_as_it_hangs(
+    run: Run, recorded: Path, tmp_path: Path
+) -> None:
+    hanging = session(
+        recorded,
+        "hanging",
+        [
+            ("cam1", "cam1/clip/*.png", "cam1/stills/*.png"),
+            ("cam2", "cam2/turned/clip/*.png", "cam2/turned/stills/*.png"),
+        ],
+    )
+
+    assert run("calibrate", hanging, "-o", tmp_path / "rig", "--no-page") == 0
+
+    found, upright = read_rig(tmp_path / "rig" / "rig.json")["cam2"], around()[1]
+    assert np.linalg.norm(found.center_world - upright.center_world) < PLACED_M
+    half_a_turn = np.diag([-1.0, -1.0, 1.0])
+    np.testing.assert_allclose(
+        found.cam_from_world[:, :3], half_a_turn @ upright.cam_from_world[:, :3], atol=0.02
+    )
+
+
+def test_exchanged_clips_are_one_line(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+) -> None:
+    exchanged = standing(recorded, "exchanged", cam1="cam3/clip", cam3="cam1/clip")
+
+    expect_no_rig(
+        run, capsys, "'cam1' and 'cam3' seem to be exchanged", exchanged, tmp_path / "rig"
+    )
+
+
+def test_a_recording_listed_twice_is_one_line(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+) -> None:
+    twice = standing(recorded, "twice", cam3="cam1/clip")
+    text = twice.read_text(encoding="utf-8").replace("cam3/stills", "cam1/stills")
+    twice.write_text(text, encoding="utf-8")
+
+    expect_no_rig(run, capsys, "'cam1' and 'cam3' show the same pictures", twice, tmp_path / "rig")
+
+
+def test_mirrored_pictures_are_one_line(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+) -> None:
+    mirrored = session(
+        recorded,
+        "mirrored",
+        [("left", "left/*.png", None), ("right", "right/mirrored/*.png", None)],
+    )
+
+    expect_no_rig(run, capsys, "seems to be mirrored", mirrored, tmp_path / "rig")
+
+
+def test_pictures_without_the_board_are_one_line(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+) -> None:
+    write(recorded / "bare/0.png", np.full((SIZE_PX[1], SIZE_PX[0]), 90, np.uint8))
+    bare = standing(recorded, "bare", cam2="bare")
+
+    expect_no_rig(
+        run, capsys, "camera 'cam2': no board of 7x6 inner corners", bare, tmp_path / "rig"
+    )
