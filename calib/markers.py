@@ -30,6 +30,7 @@ from hybridve.calib.pose import Pose
 from hybridve.calib.target import (
     SYMMETRY_BLUR_PX,
     SYMMETRY_REACH,
+    fit_homography,
     grey_of,
     move_to_symmetry,
     symmetry_offsets,
@@ -125,6 +126,8 @@ class _Pattern:
         -1 black, 0 unknown.
     border_bits : int
         How thick the markers' black border is.
+    doubt : str
+        What may be the matter where markers are read and no points are found at them.
     """
 
     label: str
@@ -134,6 +137,7 @@ class _Pattern:
     reach: float
     signs: NDArray[np.float64]
     border_bits: int
+    doubt: str = ""
 
 
 def _around(
@@ -256,7 +260,8 @@ class AprilGrid:
     Tag 0 is at the bottom left, numbers run to the right and then up. Points are listed tag by tag
     in the order of the numbers, and the four of a tag are bottom left, bottom right, top right, top
     left. (That is the order of Kalibr's detections; its table of grid points runs along the rows of
-    corners instead.)
+    corners instead.) Grids without the black squares, as OpenCV prints them, are refused: a lone
+    corner of a tag moves with blur and exposure.
 
     Attributes
     ----------
@@ -453,6 +458,7 @@ def _april_pattern(board: AprilGrid, border_bits: int) -> _Pattern:
         reach=2.3 * pitch,
         signs=_around(points, sign_at),
         border_bits=border_bits,
+        doubt=": are there no black squares between the tags' corners?",
     )
 
 
@@ -476,7 +482,7 @@ def _detect(
             continue
         corners, inverted = _find_points(here, pattern, linked)
         if corners is None:
-            tried[-1] = f"{way} ({said}, fewer than {_LEAST_POINTS} points at them)"
+            tried[-1] = f"{way} ({said}, fewer than {_LEAST_POINTS} points at them{pattern.doubt})"
             continue
         if mirrored:
             corners[:, 0] = grey.shape[1] - corners[:, 0]
@@ -763,19 +769,39 @@ def _predict(
     apart = np.linalg.norm(points[:, None] - plane, axis=-1)
     if not itself:
         apart[apart < 1e-9] = np.inf  # the tags' corners, where they are the points, go too
-    nearest = np.argsort(apart, axis=1, kind="stable")[:, : min(_ANCHORS, len(plane))]
+    # Refined points go before markers, however near those are.
+    after = apart + np.where(is_refined, 0.0, np.ptp(pattern.points, axis=0).sum() + pattern.reach)
+    nearest = np.argsort(after, axis=1, kind="stable")[:, : min(_ANCHORS, len(plane))]
     usable = np.isfinite(np.take_along_axis(apart, nearest, axis=1))
     weights = np.where(is_refined[nearest], 1.0, _MARKER_WEIGHT) * usable
     weights /= np.maximum(weights.max(axis=1, keepdims=True), _MARKER_WEIGHT)
     offsets = plane[nearest] - points[:, None]
+    # Perspective first, which a quadratic map has but in part; it leaves what lenses bend.
+    flat = fit_homography(plane[is_refined], pixels[is_refined]) if seen.sum() >= 8 else None
+    if flat is not None and not (np.concatenate([points, plane]) @ flat[2, :2] + 1.0 > 0.1).all():
+        flat = None  # its horizon is too near
+    left_px = pixels if flat is None else pixels - _mapped(flat[None], plane[None])[0]
     size = np.linalg.norm(offsets, axis=-1).max(axis=1)[:, None]
     terms = _terms(offsets / size[..., None])
     weighted = (terms * weights[..., None]).transpose(0, 2, 1)
     # What points in a row or two leave open stays flat.
     ridge = np.diag([1e-9, 1e-9, 1e-9, 1e-4, 1e-4, 1e-4])
-    maps = np.linalg.solve(weighted @ terms + ridge, weighted @ pixels[nearest])
+    maps = np.linalg.solve(weighted @ terms + ridge, weighted @ left_px[nearest])
     maps /= (size ** np.array([0, 1, 1, 2, 2, 2]))[..., None]
+    if flat is not None:
+        maps += _expanded(flat, points)
     return maps, (is_refined[nearest] & usable).sum(axis=1)
+
+
+def _expanded(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a homography (3, 3) around points (P, 2), to second order: (P, 6, 2)."""
+    at = points @ matrix[:, :2].T + matrix[:, 2]
+    value = at[:, :2] / at[:, 2:]
+    tilt = matrix[2, :2] / at[:, 2:]  # (P, 2)
+    slope = matrix[:2, :2].T / at[:, 2, None, None] - tilt[:, :, None] * value[:, None]
+    x, y = tilt[:, :1], tilt[:, 1:]
+    bend = [-x * slope[:, 0], -x * slope[:, 1] - y * slope[:, 0], -y * slope[:, 1]]
+    return np.stack([value, slope[:, 0], slope[:, 1], *bend], axis=1)
 
 
 def _predict_from_markers(linked: _Linked, points: NDArray[np.float64]) -> NDArray[np.float64]:

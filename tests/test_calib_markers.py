@@ -6,7 +6,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers.marker_boards import april_sheet, charuco_sheet, project_board, render_sheets
+from helpers.marker_boards import (
+    BLACK,
+    WHITE,
+    Sheet,
+    april_sheet,
+    charuco_sheet,
+    project_board,
+    render_sheets,
+)
 from numpy.typing import NDArray
 
 from hybridve.calib.boards import make_board
@@ -24,7 +32,7 @@ TOLD_APART_PX = 0.15
 
 CHARUCO = Charuco(8, 6, 0.1, 0.075, "DICT_5X5_100")
 APRIL = AprilGrid(3, 2, 0.1, 0.03)
-SIZE_PX = (640, 480)
+SIZE_PX = (480, 360)
 
 
 def facing(board: Charuco | AprilGrid, distance_m: float, shift_m: float = 0.0) -> Pose:
@@ -35,7 +43,7 @@ def facing(board: Charuco | AprilGrid, distance_m: float, shift_m: float = 0.0) 
 
 @pytest.fixture(scope="module")
 def camera() -> Camera:
-    return Camera("cam", "PINHOLE", *SIZE_PX, np.array([520.0, 520, 322, 238]), np.eye(3, 4))
+    return Camera("cam", "PINHOLE", *SIZE_PX, np.array([390.0, 390, 242, 178]), np.eye(3, 4))
 
 
 def errors_px(
@@ -80,28 +88,26 @@ def test_a_board_seen_in_part_has_nan_where_it_is_not_seen(camera: Camera) -> No
 
 
 @pytest.mark.parametrize("board", [CHARUCO, APRIL])
-@pytest.mark.parametrize(("inverted", "mirrored"), [(True, False), (False, True)])
 def test_inverted_and_mirrored_boards_are_found_and_said(
-    camera: Camera, board: Charuco | AprilGrid, inverted: bool, mirrored: bool
+    camera: Camera, board: Charuco | AprilGrid
 ) -> None:
     pose = facing(board, 0.9 if board is CHARUCO else 0.5)
     sheet = charuco_sheet(board, dots=112) if isinstance(board, Charuco) else april()
-    image = render_sheets(camera, [(sheet.inverted() if inverted else sheet, pose)], 2.0, 3)
-    if mirrored:
-        image = np.ascontiguousarray(image[:, ::-1])
+    image = render_sheets(camera, [(sheet, pose)], 2.0, 3)
 
-    detection = board.detect(image, "usual")
+    inverted = board.detect(WHITE + BLACK - image, "usual")
+    mirrored = board.detect(np.ascontiguousarray(image[:, ::-1]), "usual")
 
-    assert detection.corners is not None, detection.how
-    expected = ("inverted",) if inverted else ("mirrored: seen from the back",)
-    assert detection.notes == expected
-    corners = detection.corners.copy()
-    if mirrored:
-        corners[:, 0] = SIZE_PX[0] - corners[:, 0]
-    assert rms(errors_px(camera, pose, board, corners)) < RENDERED_RMS_PX
+    assert inverted.notes == ("inverted",)
+    assert mirrored.notes == ("mirrored: seen from the back",)
+    assert inverted.corners is not None
+    assert mirrored.corners is not None
+    turned = mirrored.corners * (-1, 1) + (SIZE_PX[0], 0)
+    for corners in (inverted.corners, turned):
+        assert rms(errors_px(camera, pose, board, corners)) < RENDERED_RMS_PX
 
 
-def april() -> Any:
+def april() -> Sheet:
     return april_sheet(3, 2, 0.1, 0.03)
 
 
@@ -123,7 +129,7 @@ def test_kalibrs_tags_run_from_the_bottom_left_and_their_corners_counterclockwis
 
 
 def test_two_boards_in_one_image_are_told_apart_by_their_first_marker(camera: Camera) -> None:
-    left, right = (Charuco(5, 4, 0.05, 0.0375, "DICT_4X4_100", False, n) for n in (0, 20))
+    left, right = (Charuco(5, 4, 0.05, 0.0375, "DICT_4X4_100", False, n) for n in (0, 77))
     at = [(board, facing(board, 0.6, x)) for board, x in ((left, -0.16), (right, 0.16))]
     image = render_sheets(camera, [(charuco_sheet(b, dots=80), pose) for b, pose in at], 2.0, 3)
 
@@ -131,6 +137,45 @@ def test_two_boards_in_one_image_are_told_apart_by_their_first_marker(camera: Ca
         corners = board.detect(image).corners
         assert corners is not None
         assert rms(errors_px(camera, pose, board, corners)) < TOLD_APART_PX
+
+
+def test_corners_of_squares_that_are_not_square_are_where_they_were_measured(
+    camera: Camera,
+) -> None:
+    board = Charuco(8, 6, 0.1, 0.075, "DICT_5X5_100", square_y_m=0.093)
+    pose = facing(board, 0.9)
+    image = render_sheets(camera, [(charuco_sheet(board, dots=112), pose)], 2.0, 3)
+
+    corners = board.detect(image).corners
+
+    assert corners is not None
+    assert np.isfinite(corners).all()
+    assert rms(errors_px(camera, pose, board, corners)) < RENDERED_RMS_PX
+    np.testing.assert_allclose(board.points_board[-1], [0.6, 0.372, 0.0], atol=1e-12)
+
+
+def test_in_a_large_image_points_are_as_exact() -> None:
+    camera = Camera("cam", "PINHOLE", 2401, 1603, np.array([1900.0, 1900, 1210, 790]), np.eye(3, 4))
+    board = Charuco(5, 4, 0.05, 0.0375, "DICT_4X4_100", first_id=30)
+    pose = facing(board, 0.9, 0.4)
+    image = render_sheets(camera, [(charuco_sheet(board, dots=112), pose)], 2.0, 2)
+
+    detection = board.detect(image)
+
+    assert detection.corners is not None
+    assert detection.how.startswith("markers at 0.666x"), "the image was not reduced"
+    assert np.isfinite(detection.corners).all()
+    assert rms(errors_px(camera, pose, board, detection.corners)) < RENDERED_RMS_PX
+
+
+def test_a_grid_of_tags_without_black_squares_between_them_is_refused(camera: Camera) -> None:
+    sheet = april_sheet(3, 2, 0.1, 0.03, squares=False)
+    image = render_sheets(camera, [(sheet, facing(APRIL, 0.5))], 2.0, 3)
+
+    detection = APRIL.detect(image, "usual")
+
+    assert detection.corners is None
+    assert "no black squares" in detection.how
 
 
 def test_noise_and_other_boards_are_no_board(camera: Camera) -> None:
@@ -144,6 +189,29 @@ def test_noise_and_other_boards_are_no_board(camera: Camera) -> None:
         detection = other.detect(image, "usual")
         assert detection.corners is None
         assert detection.how.startswith("tried markers")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"columns": 1, "rows": 1}, "at least 2 are needed"),
+        ({"tag_mm": None}, "tag_mm: missing"),
+        ({"marker_mm": 75}, "marker_mm: a board of kind 'aprilgrid' has none"),
+        ({"tag_spacing": 0.3}, "one of the two"),
+        ({"gap_mm": None}, "tag_spacing, its share of a tag"),
+        ({"gap_mm": None, "tag_spacing": 1.3}, r"tag_spacing = 1\.3"),
+        ({"gap_mm": 130}, "give the gap, not the distance from tag to tag"),
+        ({"gap_mm": -1}, "gap_mm = -1"),
+        ({"first_id": 585}, "markers 0 to 586"),
+    ],
+)
+def test_an_aprilgrid_that_cannot_be_is_refused_by_key(
+    change: dict[str, Any], message: str
+) -> None:
+    table = {"kind": "aprilgrid", "columns": 3, "rows": 2, "tag_mm": 100, "gap_mm": 30}
+
+    with pytest.raises(CalibrationError, match=message):
+        make_board(table | change)
 
 
 def test_a_session_describes_each_kind_of_board() -> None:

@@ -21,6 +21,9 @@ CODES_36H11 = (0xD5D628584, 0xD97F18B49, 0xDD280910E, 0xE479E9C98, 0xEBCBCA822, 
 
 BLACK, WHITE = 30, 215
 
+#: The grey level beside all sheets.
+AROUND = 120.0
+
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
@@ -51,6 +54,16 @@ class Sheet:
         grey[on] = self.print_[row[on], column[on]]
         return grey
 
+    def outline(self) -> NDArray[np.float64]:
+        """Return points all around its edge, in metres: (P, 3)."""
+        along, height_width = np.linspace(0.0, 1.0, 20), self.print_.shape
+        size_m = np.array(height_width[::-1]) * self.dot_m
+        edge = [np.column_stack([along, np.full(20, side)]) for side in (0.0, 1.0)]
+        around = np.concatenate([*edge, *(points[:, ::-1] for points in edge)]) * size_m
+        return np.column_stack(
+            [self.left_m + around[:, 0], self.top_m - around[:, 1], np.zeros(80)]
+        )
+
     def inverted(self) -> "Sheet":
         """Return the sheet printed white on black."""
         return Sheet(
@@ -78,11 +91,17 @@ def charuco_sheet(board: Charuco, legacy: bool = False, dots: int = 40) -> Sheet
 
 
 def april_sheet(
-    columns: int, rows: int, tag_m: float, gap_m: float, codes: Sequence[int] = CODES_36H11
+    columns: int,
+    rows: int,
+    tag_m: float,
+    gap_m: float,
+    codes: Sequence[int] = CODES_36H11,
+    squares: bool = True,
 ) -> Sheet:
     """Return an AprilGrid as Kalibr draws it: 10 modules a tag, two of them its border.
 
-    The gap must be a whole number of half modules.
+    The gap must be a whole number of half modules. Without `squares` nothing is black between the
+    tags, as on the grids of OpenCV.
     """
     dots = 20
     module = dots
@@ -101,7 +120,7 @@ def april_sheet(
         for i, j in np.argwhere(bits):
             left, bottom = x + (2 + j) * module, y + (7 - i) * module
             paper[bottom : bottom + module, left : left + module] = WHITE
-        for corner_x in (x - gap, x + tag):
+        for corner_x in (x - gap, x + tag) if squares else ():
             for corner_y in (y - gap, y + tag):
                 paper[corner_y : corner_y + gap, corner_x : corner_x + gap] = BLACK
     paper = np.pad(paper, gap, constant_values=WHITE)
@@ -121,10 +140,17 @@ def render_sheets(
 ) -> NDArray[np.uint8]:
     """Render sheets at their cam_from_board; each pixel is the mean of `samples` squared rays.
 
-    The rays pass at places that differ from pixel to pixel. Earlier sheets cover later ones.
+    The rays pass at places that differ from pixel to pixel. Earlier sheets cover later ones; all of
+    each lies before the camera.
     """
     rng = np.random.default_rng(seed)
-    columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+    image = np.full((camera.height_px, camera.width_px), AROUND)
+    # Elsewhere no ray meets a sheet.
+    outlines = [img_from_cam(camera, transform(pose, sheet.outline())) for sheet, pose in sheets]
+    lowest, highest = (side(np.concatenate(outlines), axis=0) for side in (np.min, np.max))
+    left, top = np.clip(np.floor(lowest).astype(int), 0, image.shape[::-1])
+    right, bottom = np.clip(np.ceil(highest).astype(int), 0, image.shape[::-1])
+    columns, rows = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
     total = np.zeros(columns.shape)
     for sub_row in range(samples):
         for sub_column in range(samples):
@@ -140,8 +166,8 @@ def render_sheets(
                 here = sheet.grey(points, np.nan)
                 here[reach < 0] = np.nan
                 grey = np.where(np.isnan(grey), here, grey)
-            total += np.nan_to_num(grey, nan=120.0).reshape(total.shape)
-    image = total / samples**2
+            total += np.nan_to_num(grey, nan=AROUND).reshape(total.shape)
+    image[top:bottom, left:right] = total / samples**2
     if noise_grey:
         image = image + rng.normal(0.0, noise_grey, image.shape)
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
