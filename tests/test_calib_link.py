@@ -471,8 +471,9 @@ def test_two_cameras_in_one_place_are_a_warning() -> None:
 
     linked = link(recording)
 
-    (warning,) = linked.warnings
-    assert "'cam1' and 'cam7' stand in one place" in warning
+    alike, coincide = linked.warnings
+    assert "'cam1' and 'cam7' are alike" in alike
+    assert "'cam1' and 'cam7' stand in one place" in coincide
 
 
 @pytest.mark.parametrize("is_still", [True, False])
