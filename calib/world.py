@@ -114,7 +114,8 @@ class SeenBoards:
     def main(self) -> tuple[int, int, frozenset[int]]:
         """Return the pose and board that most cameras see, the earliest of these; and who does.
 
-        Boards of the clip go before those of stills; of several boards the first listed counts.
+        Boards of the clip go before those of stills; of several boards the first
+        of `boards` counts (a calibration gives them in order of name).
         """
         seeing: dict[tuple[int, int], set[int]] = {}
         for view in self.views:

@@ -281,8 +281,7 @@ def test_exchanged_clips_of_different_lenses_are_named() -> None:
 
 
 DOUBTED: dict[str, tuple[Callable[[], list[Observations]], str]] = {
-    "zoomed a little": (lambda: zoomed(1.08), "'cam2'|board clip misses its lens|same zoom"),
-    "zoomed": (lambda: zoomed(1.3), "'cam2'|board clip misses its lens|same zoom"),
+    "zoomed": (lambda: zoomed(1.08), "'cam2'|board clip misses its lens|same zoom"),
     "a board of another shape": (
         lambda: stretched((1.0, 0.8, 1.0)),
         "'cam2'|board clip misses its lens|is the board the same",
@@ -502,21 +501,16 @@ def test_a_mirrored_board_of_markers_on_the_floor_puts_its_camera_below() -> Non
 
 
 def test_a_camera_that_saw_another_board_is_doubted() -> None:
-    seen, camera = carried(), row_of_cameras(3, 0.25, "SIMPLE_PINHOLE")[1]
-    points = CARRIED.points_board * 0.7
-    smaller = tuple(
-        replace(
-            s,
-            pixels=img_from_cam(
-                camera,
-                transform(compose(camera.cam_from_world, carried_poses()[s.instant][0]), points),
-            ),
-        )
-        for s in seen[1].sightings
-        if s.instant is not None
-    )
+    camera = row_of_cameras(3, 0.25, "SIMPLE_PINHOLE")[1]
+    seen = [replace(one, sightings=one.sightings[:6]) for one in carried()]
+    smaller = []
+    for sighting in seen[1].sightings:
+        assert sighting.instant is not None
+        pose = compose(camera.cam_from_world, carried_poses()[sighting.instant][0])
+        pixels = img_from_cam(camera, transform(pose, CARRIED.points_board * 0.7))
+        smaller.append(replace(sighting, pixels=pixels))
 
-    _, certificate = calibrated([CARRIED], instead(seen, 1, sightings=smaller))
+    _, certificate = calibrated([CARRIED], instead(seen, 1, sightings=tuple(smaller)))
 
     assert_doubted(
         "'cam2' does not agree with the others|of a board as it is described", certificate
@@ -565,7 +559,7 @@ def test_groups_that_never_meet_are_named_with_the_nearest_edge() -> None:
 def facing() -> tuple[list[Chessboard], list[Observations], dict[int, Pose], list[Camera]]:
     """Two cameras that face each other, and a panel with a board on both sides between them."""
     front = Chessboard(7, 6, 0.08, name="front", body="panel")
-    back = Chessboard(8, 5, 0.08, name="back", body="panel")
+    back = Chessboard(8, 5, 0.08, name="rear", body="panel")
     cameras = [
         make_camera("south", "SIMPLE_PINHOLE", look_at((0.0, -2.0, 0.1), (0.0, 0.0, 0.0))),
         make_camera("north", "SIMPLE_PINHOLE", look_at((0.3, 2.0, 0.0), (0.0, 0.0, 0.0))),
@@ -747,7 +741,7 @@ def spoilt(rng: np.random.Generator) -> tuple[list[Chessboard], list[Observation
     return [board], spoilt_seen, true
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(24))
 def test_what_is_left_of_a_recording_gives_an_honest_rig_or_a_reason(seed: int) -> None:
     boards, seen, true = spoilt(np.random.default_rng(seed))
 
