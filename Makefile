@@ -18,8 +18,9 @@ check: setup
 	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml -p hybridve
 	$(BIN)/lint-imports
 
+# Files of tests side by side; one file stays with one process, so that fixtures are made once.
 pytest: setup
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist loadfile --benchmark-disable
 
 bench: setup
 	$(BIN)/pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' \
