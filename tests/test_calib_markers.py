@@ -25,10 +25,10 @@ from hybridve.calib.pose import Pose
 from hybridve.calib.target import Chessboard
 
 #: What 9 rays a pixel and noise leave of a point's place.
-RENDERED_RMS_PX = 0.06
+RENDERED_RMS_PX = 0.03
 
 #: The other board's points are hundreds of pixels away.
-TOLD_APART_PX = 0.15
+TOLD_APART_PX = 0.05
 
 CHARUCO = Charuco(8, 6, 0.1, 0.075, "DICT_5X5_100")
 APRIL = AprilGrid(3, 2, 0.1, 0.03)
