@@ -797,18 +797,19 @@ def _refuse_copies(boards: Sequence[NamedBoard], observations: Sequence[Observat
             )
             for key in common
         ]
+        apart_px = [px for px in apart_px if np.isfinite(px)]
         if not apart_px:
             continue
         names = f"cameras {ordered[one].name!r} and {ordered[other].name!r}"
         if max(apart_px) < _SAME_PICTURE_PX:
             raise CalibrationError(
-                f"{names} show the same pictures: in {len(common)} common views the corners are "
+                f"{names} show the same pictures: in {len(apart_px)} common views the corners are "
                 "the same to the pixel; list each camera once, with its own files"
             )
         if np.median(apart_px) < _ALIKE_PX:
             warnings.append(
-                f"the pictures of {names} are alike: in {len(common)} common views the corners are "
-                f"{np.median(apart_px):.2f} px apart at most (median); is one recording listed "
+                f"the pictures of {names} are alike: in {len(apart_px)} common views the corners "
+                f"are {np.median(apart_px):.2f} px apart at most (median); is one recording listed "
                 "twice?"
             )
     return warnings

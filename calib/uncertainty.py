@@ -50,6 +50,10 @@ _SPHERE_POINTS = 24
 #: Entries a side of the table from which `radius95` reads, linearly between them.
 _TABLE_POINTS = 33
 
+#: Rays at less than a millionth of a radian are one, and place no point: the share of the largest
+#: eigenvalue of what they tell of it that the smallest must reach.
+_ONE_RAY = 1e-12
+
 #: Points of a pixel grid over an image, a side, for the error within the image.
 _IMAGE_POINTS = 9
 
@@ -433,7 +437,8 @@ def point_gains(
     -------
     gains : (N, 3, P) float64
         Metres a unit of each parameter: where the truth is off by dp, a point that is seen from
-        the truth is placed ``gains @ dp`` off. NaN where fewer than two cameras see the point.
+        the truth is placed ``gains @ dp`` off. NaN where fewer than two cameras see the point, or
+        all of them along one ray.
     n_seeing : (N,) int
         Cameras that do.
     """
@@ -448,7 +453,8 @@ def point_gains(
         moments[seen, :, span] = by_point[seen].transpose(0, 2, 1) @ by_parameter[seen]
         n_seeing += seen
     gains = np.full_like(moments, np.nan)
-    placed = n_seeing >= 2
+    spread = np.linalg.eigvalsh(information)  # rays at an angle a: about a^2 / 4 of the largest
+    placed = (n_seeing >= 2) & (spread[:, 0] > _ONE_RAY * spread[:, -1])
     if placed.any():
         gains[placed] = np.linalg.solve(information[placed], moments[placed])
     return gains, n_seeing

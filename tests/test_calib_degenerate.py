@@ -303,6 +303,21 @@ DOUBTED: dict[str, tuple[Callable[[], list[Observations]], str]] = {
 }
 
 
+def test_cameras_in_exactly_one_place_place_no_point() -> None:
+    calibration, _ = calibrated([LYING], lying(around()[:2]))
+    camera = calibration.rig.cameras[0]
+    assert calibration.rig.covariance is not None
+    labels = calibration.rig.covariance.labels
+    named = tuple(label.replace("cam2", "twin") for label in labels)
+    covariance = replace(calibration.rig.covariance, labels=named)
+    twice = Rig((camera, replace(camera, name="twin")), covariance=covariance)
+
+    certificate = certify(twice, {}, calibration.noise, working_volume(twice))
+
+    assert np.isnan(certificate.error95_m)
+    assert "no error in mm can be stated" in certificate.verdict
+
+
 @pytest.mark.parametrize("case", DOUBTED)
 def test_a_recording_that_contradicts_itself_gives_a_rig_that_is_doubted(case: str) -> None:
     make, named = DOUBTED[case]
