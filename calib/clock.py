@@ -18,7 +18,7 @@ Robotics 32(2), 2016 (the offset as one more parameter of the adjustment).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from typing import Protocol
 
@@ -53,10 +53,29 @@ _CONVERGED_FRAMES = 1e-8
 #: Residuals beyond this many robust standard deviations weigh less than squared.
 _LOSS_SIGMAS = 3.0
 
-#: The least share of the corners' speed (mean square) that must be motion rather than noise, and
-#: the largest standard deviation of an offset that counts as known, frames.
+#: The least share of the corners' speed (mean square) that must be motion rather than noise: of all
+#: of it, and of that which tells an offset; the mean square, (pixels a frame) squared, of no motion
+#: at all; and the largest standard deviation of an offset that counts as known, frames.
 _MIN_MOTION = 0.75
+_MIN_TELLING = 0.5
+_STILL = 1e-12
 _KNOWN_FRAMES = 0.25
+
+#: A view is off its path if its corners, in the median, are further from a cubic through four
+#: frames around it than all of these: so many times what the best tenth are (the noise), so much of
+#: a step from frame to frame (a swing to and fro within 6 frames), and pixels.
+_USUAL = 0.1
+_JUMP_USUAL = 20.0
+_JUMP_STEPS = 0.15
+_JUMP_PX = 1.0
+
+#: Views of the path are looked for so many frames away, and must have so many points in common. By
+#: `_PATH_GAIN` the variance of noise grows where a view is compared with its four neighbours; where
+#: noise grows more, up to so many times more is allowed for.
+_PATH_REACH = 8
+_PATH_POINTS = 4
+_PATH_GAIN = 1.0 + 34.0 / 36.0
+_MAX_GAIN = 3.0
 
 
 class SolvedLens(Protocol):
@@ -86,6 +105,9 @@ class Clocks:
         Of the corners that the offsets were fitted to; NaN where none were.
     notes : tuple of str
         Why an offset is not known.
+    left_out : dict of str to tuple of int
+        By camera the instants at which a board, all of it, is far off its path through the frames
+        before and after; nothing was told by these.
     """
 
     reference: str
@@ -94,6 +116,7 @@ class Clocks:
     is_known: dict[str, bool]
     rms_px: float
     notes: tuple[str, ...] = ()
+    left_out: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
 
 #: By board and instant the points that a camera saw: (N, 2), pixels or rays.
@@ -125,6 +148,7 @@ def estimate_offsets(
     offsets, stds = np.full(n_cameras, np.nan), np.full(n_cameras, np.nan)
     offsets[0] = stds[0] = 0.0
     notes: dict[int, str] = {}
+    left_out: dict[str, tuple[int, ...]] = dict.fromkeys(names, ())
     rms_px = np.nan
     if any(observations[index].is_still for index in order):
         notes |= dict.fromkeys(range(1, n_cameras), "the boards lie still in the clip")
@@ -133,6 +157,10 @@ def estimate_offsets(
         tracks = [_tracks(observations[index].sightings) for index in order]
         spacing = _spacing(tracks)
         tracks = [_listed_alike(boards, seen, spacing) for seen in tracks]
+        for camera, seen in enumerate(tracks):
+            jumped = _jumped(seen, spacing)
+            left_out[names[camera]] = tuple(sorted({instant for _, instant in jumped}))
+            tracks[camera] = {key: seen[key] for key in seen if key not in jumped}
         poses = [_located(boards, *pair) for pair in zip(cameras, tracks, strict=True)]
         start = _start(boards, poses, spacing, max_offset_frames)
         for index in range(1, n_cameras):
@@ -153,7 +181,7 @@ def estimate_offsets(
                 std = found.std_frames[index]
                 if found.motion[index] < _MIN_MOTION:
                     notes[index] = "the board hardly moves before it"
-                elif not std < _KNOWN_FRAMES:
+                elif not (std < _KNOWN_FRAMES and found.telling[index] > _MIN_TELLING):
                     notes[index] = (
                         "the board's motion does not tell it: move it to and fro, and turn it"
                     )
@@ -169,6 +197,7 @@ def estimate_offsets(
             f"camera {names[index]!r}: its offset in time cannot be told: {why}"
             for index, why in sorted(notes.items())
         ),
+        left_out,
     )
 
 
@@ -179,8 +208,9 @@ def resampled(
 ) -> list[Observations]:
     """Return what the cameras would have seen of moving boards, had their clocks been right.
 
-    Corners are interpolated by cubics through four neighbouring frames, where these were seen;
-    other sightings in the clip are left out. Stills, still clips and cameras without offset stay.
+    Corners are interpolated by cubics through four neighbouring frames, where these were seen, and
+    none of them is off the path of the others; other sightings in the clip are left out. Stills,
+    still clips and cameras without offset stay.
 
     Parameters
     ----------
@@ -205,6 +235,8 @@ def resampled(
         tracks = _tracks(seen.sightings)
         if boards is not None:
             tracks = _listed_alike(boards, tracks, spacing)
+        jumped = _jumped(tracks, spacing)
+        tracks = {key: tracks[key] for key in tracks if key not in jumped}
         stills = tuple(s for s in seen.sightings if s.instant is None)
         moved = []
         for instant in instants:
@@ -224,12 +256,15 @@ def resampled(
 class _Interpolated:
     """Points (N, 2) between frames, their speed a frame, and what becomes of noise in both.
 
-    Noise of variance 1 in the frames becomes `noise` in the points, `speed_noise` in the speed,
-    and makes the two covary by `common_noise`.
+    The points are the sum of those in `frames`, by `weights`. Noise of variance 1 in the frames
+    becomes `noise` in the points, `speed_noise` in the speed, and makes the two covary by
+    `common_noise`.
     """
 
     points: NDArray[np.float64]
     speed: NDArray[np.float64]
+    frames: tuple[int, ...]
+    weights: NDArray[np.float64]
     noise: float
     speed_noise: float
     common_noise: float
@@ -266,21 +301,112 @@ def _spacing(tracks: Sequence[_Tracks]) -> int:
     return min((b - a for a, b in pairwise(instants)), default=1)
 
 
+def _jumped(tracks: _Tracks, spacing: int) -> set[tuple[int, int]]:
+    """Return the views, by board and instant, that are off the path of those around them."""
+    jumped: set[tuple[int, int]] = set()
+    for board in sorted({board for board, _ in tracks}):
+        path = {instant: tracks[b, instant] for b, instant in sorted(tracks) if b == board}
+        jumped |= {(board, instant) for instant in _off_path(path, spacing)}
+    return jumped
+
+
+def _off_path(path: Mapping[int, NDArray[np.float64]], spacing: int) -> set[int]:
+    """Return the instants of a path at which the board was found elsewhere.
+
+    A view between two frames before and two behind is on the path if it lies on the cubic through
+    them. Of the others, most only have a neighbour that is off: they are on the path if they lie
+    on the cubic through the nearest views that are. What cannot be judged stays.
+    """
+    around = [step * spacing for step in (-2, -1, 1, 2)]
+    misses = {}
+    for instant in path:
+        nodes = tuple(instant + step for step in around)
+        if all(node in path for node in nodes):
+            misses[instant] = _miss(path, instant, nodes)
+    found = [miss.length_px for miss in misses.values() if miss is not None]
+    if not found:
+        return set()
+    least_px = max(_JUMP_USUAL * float(np.quantile(found, _USUAL)), _JUMP_PX)
+    on = {t for t, miss in misses.items() if miss is not None and miss.is_small(least_px)}
+    again: dict[tuple[int, ...], _Miss | None] = {}
+    while True:
+        best: tuple[float, int] | None = None
+        for instant in sorted(path.keys() - on):
+            near = [node for node in on if abs(node - instant) <= _PATH_REACH * spacing]
+            if len(near) < len(around):
+                continue
+            nearest = sorted((abs(node - instant), node) for node in near)[: len(around)]
+            nodes = tuple(sorted(node for _, node in nearest))
+            if (instant, *nodes) not in again:
+                again[instant, *nodes] = _miss(path, instant, nodes)
+            misses[instant] = miss = again[instant, *nodes]
+            if miss is not None and miss.is_small(least_px):
+                best = (miss.gain, instant) if best is None else min(best, (miss.gain, instant))
+        if best is None:
+            return {t for t, miss in misses.items() if miss is not None and t not in on}
+        on.add(best[1])  # the surest first: it may show others to be off
+
+
+@dataclass(frozen=True, slots=True)
+class _Miss:
+    """By how much a view misses a cubic through four others, median over its points, pixels.
+
+    `gain` says by how much more than between neighbours noise and acceleration show, `step_px` how
+    far points move from frame to frame.
+    """
+
+    length_px: float
+    gain: float
+    step_px: float
+
+    def is_small(self, least_px: float) -> bool:
+        limit_px = max(least_px, _JUMP_STEPS * self.step_px)
+        return self.length_px <= min(self.gain, _MAX_GAIN) * limit_px
+
+
+def _miss(
+    path: Mapping[int, NDArray[np.float64]], instant: int, nodes: Sequence[int]
+) -> _Miss | None:
+    """Compare a view with four others; None where they have few points in common."""
+    weights = np.ones(len(nodes))
+    for index, node in enumerate(nodes):
+        for other in nodes:
+            if other != node:
+                weights[index] *= (instant - other) / (node - other)
+    frames = np.stack([path[node] for node in nodes])
+    missed = np.tensordot(weights, frames, axes=1) - path[instant]
+    common = is_seen(missed)
+    if common.sum() < _PATH_POINTS:
+        return None
+    steps = np.linalg.norm(np.median(np.diff(frames[:, common], axis=0), axis=1), axis=1)
+    return _Miss(
+        float(np.linalg.norm(np.median(missed[common], axis=0))),
+        float(np.sqrt((1.0 + (weights**2).sum()) / _PATH_GAIN)),
+        float(np.median(steps / np.diff(nodes))),
+    )
+
+
 def _interpolated(tracks: _Tracks, board: int, time: float, spacing: int) -> _Interpolated | None:
     """Return a board's points at a time between frames; None unless four frames around show it.
 
-    Points that are not seen in all four are NaN. At a frame itself its own points are returned.
+    Points that are not seen in all four are NaN. At a frame itself its own points are returned,
+    without speed where the frames around do not show the board.
     """
     phase = next((instant % spacing for b, instant in tracks if b == board), 0)
     first = int(np.floor((time - phase) / spacing)) * spacing + phase
     nodes = [first + step * spacing for step in (-1, 0, 1, 2)]
     if any((board, node) not in tracks for node in nodes):
-        return None
+        if time != first or (board, first) not in tracks:
+            return None
+        alone = tracks[board, first]
+        return _Interpolated(alone, np.zeros_like(alone), (first,), np.ones(1), 1.0, 0.0, 0.0)
     weights, slopes = _cubic((time - first) / spacing)
     frames = np.stack([tracks[board, node] for node in nodes])
     return _Interpolated(
         np.tensordot(weights, frames, axes=1),
         np.tensordot(slopes, frames, axes=1) / spacing,
+        tuple(nodes),
+        weights,
         float((weights**2).sum()),
         float((slopes**2).sum()) / spacing**2,
         float((weights * slopes).sum()) / spacing,
@@ -421,9 +547,16 @@ def _whole_offset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
+    """Offsets, and how far they can be trusted.
+
+    `motion` is the share of the corners' mean square speed that is no noise, `telling` the same of
+    what tells an offset: the speed that no other place of the camera and the boards explains.
+    """
+
     offset_frames: NDArray[np.float64]
     std_frames: NDArray[np.float64]
     motion: NDArray[np.float64]
+    telling: NDArray[np.float64]
     rms_px: float
 
 
@@ -490,13 +623,16 @@ class _Problem:
             {key: _rays(camera, pixels) for key, pixels in seen.items()}
             for camera, seen in zip(cameras, tracks, strict=True)
         ]
-        # A margin of one frame on both sides: fractions are not known yet.
+        # Fractions are not known yet, but for the session's own clock: a camera's frame needs its
+        # neighbours, and one more on either side.
         usable: dict[tuple[int, int], list[int]] = {}
         for camera in sorted(start):
             late = start[camera].offset
             for key in sorted(rays[camera].keys() & poses[camera].keys()):
-                around = [(key[0], key[1] + step * spacing) for step in (-2, -1, 1, 2)]
-                if all(neighbour in rays[camera] for neighbour in around):
+                around = [
+                    (key[0], key[1] + step * spacing) in rays[camera] for step in (-2, -1, 1, 2)
+                ]
+                if camera == 0 or (any(around[::3]) and all(around[1:3])):
                     usable.setdefault((key[0], key[1] + late), []).append(camera)
         shared = sorted(key for key, seeing in usable.items() if len(seeing) > 1)
         if len(shared) < _MIN_COMMON:
@@ -555,38 +691,74 @@ class _Problem:
             if moved < _CONVERGED_FRAMES:
                 break
         weights, _ = self._weights(sampled)
-        normal, _, _ = self._normal_equations(sampled, weights)
-        # Interpolation smooths noise, and neighbouring instants share it: the noise of the frames
-        # themselves is what remains in the mean.
+        normal, _, back = self._normal_equations(sampled, weights)
+        # Interpolation smooths noise: that of the frames themselves is what is sought.
         n_points = int(sampled.seen.sum())
-        n_unknown = 6 * len(self.rig_from_board) + len(normal)
+        n_seen_poses = len(np.unique(self.poses[sampled.seen.any(axis=1)]))
+        n_unknown = 6 * n_seen_poses + len(normal)
+        share_left = max(2 * n_points - n_unknown, 1) / max(2 * n_points, 1)
         square = (weights * (sampled.residuals**2).sum(axis=2)).sum(axis=1) / sampled.noise
         variance = float(square.sum()) / max(2 * n_points - n_unknown, 1)
+        # Noise in the speed looks like motion, and so like knowledge, and no pose of the board
+        # explains it away; and noise in points is smoothed most half-way between frames, where
+        # residuals are smallest, which pulls the offset there. Both are expected values, and are
+        # taken off.
+        of_noise = 2.0 * share_left * variance * (weights * sampled.seen).sum(axis=1)
+        pull, false_motion = np.zeros((2, len(self.offsets), 7))
+        np.add.at(pull[:, 6], self.cameras, of_noise * sampled.common_noise)
+        np.add.at(false_motion[:, 6], self.cameras, of_noise * sampled.speed_noise)
         scale = np.sqrt(np.diag(normal)) + 1e-12
-        covariance = np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True)
-        covariance *= variance / np.outer(scale, scale)
-        # Noise is smoothed most half-way between frames, where residuals are smallest: that pull
-        # (the slope of the expected noise) is taken off.
-        n_seen = sampled.seen.sum(axis=1)
-        pull = np.zeros((len(self.offsets), 7))
-        share_left = max(2 * n_points - n_unknown, 1) / (2 * n_points)
-        of_noise = 2.0 * share_left * variance * n_seen * sampled.common_noise
-        np.add.at(pull[:, 6], self.cameras, of_noise)
+        true_normal = normal - np.diag(false_motion[1:].ravel())
+        inverse = np.linalg.pinv(true_normal / np.outer(scale, scale), hermitian=True)
+        inverse /= np.outer(scale, scale)
         offsets = self.offsets.copy()
-        offsets[1:] -= (covariance @ pull[1:].ravel() / max(variance, 1e-30)).reshape(-1, 7)[:, 6]
-        offset_stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        stds, motion = np.zeros(len(self.offsets)), np.ones(len(self.offsets))
+        offsets[1:] -= (inverse @ pull[1:].ravel()).reshape(-1, 7)[:, 6]
+        scatter = self._scatter(sampled, weights, back)
+        covariance = variance * inverse @ scatter @ inverse
+        stds = np.zeros(len(self.offsets))
+        motion, telling = np.ones((2, len(self.offsets)))
         for camera in range(1, len(self.offsets)):
-            mine = self.cameras == camera
-            speed = sampled.speed[mine][sampled.seen[mine]]
-            power = float((speed**2).sum(axis=1).mean()) if len(speed) else 0.0
-            noise = 2.0 * variance * float(sampled.speed_noise[mine].mean()) if len(speed) else 0.0
-            motion[camera] = (power - noise) / power if power > 1e-12 else 0.0
-            std = offset_stds[7 * (camera - 1) + 6]
-            # Noise in the speed looks like motion, and like knowledge: it is taken off again.
-            stds[camera] = std / np.sqrt(max(motion[camera], 1e-6))
+            column = 7 * (camera - 1) + 6
+            stds[camera] = np.sqrt(max(float(covariance[column, column]), 0.0))
+            false, power = false_motion[camera, 6], float(normal[column, column])
+            motion[camera] = 1.0 - false / power if power > _STILL * n_points else 0.0
+            left = float(inverse[column, column])
+            telling[camera] = 1.0 / (1.0 + false * left) if left > 0.0 else 0.0
         total = float((sampled.residuals**2).sum()) / max(n_points, 1)
-        return _Found(offsets, stds, motion, float(np.sqrt(total)))
+        return _Found(offsets, stds, motion, telling, float(np.sqrt(total)))
+
+    def _scatter(
+        self, sampled: _Sampled, weights: NDArray[np.float64], back: "_Back"
+    ) -> NDArray[np.float64]:
+        """Return the covariance of the right-hand side for noise of variance 1 in the frames.
+
+        Neighbouring instants are interpolated from the same frames, and share their noise: it is
+        summed up frame by frame.
+        """
+        size = len(back.solved[0, 0])
+        camera_part, board_part = self._slopes(sampled)
+        scatter = np.zeros((size, size))
+        for camera in np.unique(self.cameras):
+            of_frame: dict[tuple[int, int], NDArray[np.float64]] = {}
+            for row in np.flatnonzero(self.cameras == camera).tolist():
+                _, pose, board, instant, listing = self.views[row]
+                track = _interpolated(
+                    self.rays[camera], board, instant - self.offsets[camera], self.spacing
+                )
+                if track is None:
+                    continue
+                slopes = -board_part[row] @ back.solved[pose]  # (N, 2, size)
+                if camera > 0:
+                    slopes[..., 7 * (camera - 1) : 7 * camera] += camera_part[row]
+                unlisted = np.zeros_like(slopes)
+                unlisted[listing] = weights[row][:, None, None] * slopes
+                for frame, share in zip(track.frames, track.weights, strict=True):
+                    sums = of_frame.setdefault((board, frame), np.zeros_like(unlisted))
+                    sums += share * unlisted
+            for sums in of_frame.values():
+                flat = sums.reshape(-1, size)
+                scatter += flat.T @ flat
+        return scatter
 
     def _sample(
         self,
@@ -648,14 +820,8 @@ class _Problem:
         self, sampled: _Sampled, weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], "_Back"]:
         """Return the equations of cameras and offsets, the boards' poses eliminated."""
-        n_views = len(self.views)
         n_cameras, n_poses = len(self.offsets), len(self.rig_from_board)
-        camera_part = np.zeros((n_views, sampled.residuals.shape[1], 2, 7))
-        camera_part[..., :6] = _by_motion(sampled.by_point, sampled.points_cam)
-        camera_part[..., 6] = sampled.speed  # the residual falls by it as the offset grows
-        seeing = self.cam_from_rig[self.cameras]
-        points_rig = (sampled.points_cam - seeing[:, None, :, 3]) @ seeing[:, :, :3]
-        board_part = _by_motion(sampled.by_point @ seeing[:, None, :, :3], points_rig)
+        camera_part, board_part = self._slopes(sampled)
         weighted = weights[..., None, None] * camera_part
         cc = np.einsum("vnki,vnkj->vij", weighted, camera_part)
         cb = np.einsum("vnki,vnkj->vij", weighted, board_part)
@@ -685,6 +851,15 @@ class _Problem:
         ]
         reduced = right[1:].ravel() - np.einsum("pia,pa->i", flat, solved_right)
         return whole, reduced, _Back(solved, solved_right)
+
+    def _slopes(self, sampled: _Sampled) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return by what residuals fall: camera and offset (V, N, 2, 7), board (V, N, 2, 6)."""
+        camera_part = np.zeros((*sampled.residuals.shape, 7))
+        camera_part[..., :6] = _by_motion(sampled.by_point, sampled.points_cam)
+        camera_part[..., 6] = sampled.speed
+        seeing = self.cam_from_rig[self.cameras]
+        points_rig = (sampled.points_cam - seeing[:, None, :, 3]) @ seeing[:, :, :3]
+        return camera_part, _by_motion(sampled.by_point @ seeing[:, None, :, :3], points_rig)
 
     def _moved(
         self, step: NDArray[np.float64], board_steps: NDArray[np.float64]
