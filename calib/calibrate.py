@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from hybridve.calib.board import Board, Observations, is_seen
 from hybridve.calib.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose
 from hybridve.calib.camera import N_PARAMS, Camera
-from hybridve.calib.clock import estimate_offsets, resampled
+from hybridve.calib.clock import estimate_offsets, noise_shares, resampled
 from hybridve.calib.consensus import common_pose
 from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
@@ -227,13 +227,16 @@ def solve_rig(
     fixed = [seen for seen in ordered if seen.name not in tracks]
     moving = [seen for seen in ordered if seen.name in tracks]
     about: dict[str, Any] = {}
+    shares: dict[str, float] = {}
     if settings.sync == "estimate" and fixed:
-        fixed = _synchronised(boards, fixed, settings, requests, about)
+        fixed, shares = _synchronised(boards, fixed, settings, requests, about)
     lenses = _fit_lenses(boards, [*fixed, *moving], settings.lens, requests, report)
     report("adjusting everything", 0, 1)
     solved = None
     if fixed:
-        solved = _solve_fixed(boards, fixed, lenses[: len(fixed)], requests, settings, about)
+        solved = _solve_fixed(
+            boards, fixed, lenses[: len(fixed)], requests, settings, about, shares
+        )
     mounted = [
         _mount(boards, seen, lens, tracks[seen.name], solved)
         for seen, lens in zip(moving, lenses[len(fixed) :], strict=True)
@@ -345,8 +348,8 @@ def _synchronised(
     settings: CalibrationSettings,
     requests: Mapping[str, LensRequest],
     about: dict[str, Any],
-) -> list[Observations]:
-    """Return observations as clocks that agree would have made them."""
+) -> tuple[list[Observations], dict[str, float]]:
+    """Return observations as clocks that agree would have made them, and their `noise_shares`."""
     if all(seen.is_still for seen in observations):
         raise CalibrationError(
             "the cameras' clocks cannot be compared: the boards lie still in the clip; record a "
@@ -368,7 +371,10 @@ def _synchronised(
     }
     for note in clocks.notes:
         logger.warning("clocks: %s", note)
-    return resampled(observations, clocks.offset_frames, boards)
+    return (
+        resampled(observations, clocks.offset_frames, boards),
+        noise_shares(observations, clocks.offset_frames),
+    )
 
 
 # --- Fixed cameras ----------------------------------------------------------------------------
@@ -394,6 +400,7 @@ def _solve_fixed(
     requests: Mapping[str, LensRequest],
     settings: CalibrationSettings,
     about: dict[str, Any],
+    shares: Mapping[str, float],
 ) -> _Solved:
     is_still = all(seen.is_still for seen in observations)
     seen: Sequence[Observations] = observations
@@ -413,7 +420,7 @@ def _solve_fixed(
         linked, warnings=(*linked.warnings, *_disagreeing(boards, lenses, linked, rough))
     )
     cleaned, outliers = _without_outliers(rough)
-    adjusted, noise, groups = _adjust_weighed(cleaned, linked)
+    adjusted, noise, groups = _adjust_weighed(cleaned, linked, shares)
     about["noise_by_group"] = {name: asdict(told) for name, told in groups.items()}
     placed = place_world(
         settings.world,
@@ -442,11 +449,15 @@ def _solve_fixed(
     )
 
 
-def _adjust_weighed(bundle: Bundle, linked: Linked) -> tuple[Adjusted, Noise, dict[str, Noise]]:
+def _adjust_weighed(
+    bundle: Bundle, linked: Linked, shares: Mapping[str, float]
+) -> tuple[Adjusted, Noise, dict[str, Noise]]:
     """Adjust a bundle with each view weighed by the noise of its kind; return that noise, too.
 
     The clip and the stills of each camera are kinds of their own: a board in hand is blurred where
-    one on the floor, averaged over many frames, is not.
+    one on the floor, averaged over many frames, is not. Where the clip's points are interpolated,
+    `shares` says which share of the noise of frames is left of each camera's: its views are weighed
+    by the noise of frames.
     """
     even = adjust(bundle)
     groups = [
@@ -456,6 +467,18 @@ def _adjust_weighed(bundle: Bundle, linked: Linked) -> tuple[Adjusted, Noise, di
         for view in bundle.views
     ]
     noise, by_group = measure_noise(even), measure_group_noise(even, groups)
+    if shares and "board clip" in by_group:
+        left, counts = np.array(
+            [
+                (shares[bundle.cameras[view.camera].name], is_seen(view.pixels).sum())
+                for view, group in zip(bundle.views, groups, strict=True)
+                if group == "board clip"
+            ]
+        ).T
+        told, factor = by_group["board clip"], (left @ counts / counts.sum()) ** -0.5
+        by_group["board clip"] = replace(
+            told, rough_px=factor * told.rough_px, smooth_px=factor * told.smooth_px
+        )
     # Points without noise (generated ones) are weighed alike, and leave no doubt.
     sigmas_px = [max(by_group[group].smooth_px, _LEAST_SIGMA_PX) for group in groups]
     weighed = replace(

@@ -249,6 +249,32 @@ def resampled(
     return found
 
 
+def noise_shares(
+    observations: Sequence[Observations], offset_frames: Mapping[str, float]
+) -> dict[str, float]:
+    """Return by camera the variance of noise in `resampled` points, that in its frames being 1.
+
+    Interpolated points are less noisy than those of frames, but neighbours share their noise: all
+    together they tell no more than the frames do. Where they are taken for independent, as all
+    pictures are, their noise must be taken to be that of the frames.
+
+    Parameters
+    ----------
+    observations : sequence of Observations
+        What the cameras saw, not resampled.
+    offset_frames : mapping of str to float
+        As for `resampled`.
+    """
+    spacing = _spacing([_tracks(seen.sightings) for seen in observations])
+    shares = {}
+    for seen in observations:
+        offset = offset_frames.get(seen.name, 0.0)
+        is_moved = not seen.is_still and np.isfinite(offset)
+        weights, _ = _cubic((-offset / spacing) % 1.0 if is_moved else 0.0)
+        shares[seen.name] = float((weights**2).sum())
+    return shares
+
+
 # --- Tracks ----------------------------------------------------------------------------------
 
 
