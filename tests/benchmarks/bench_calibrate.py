@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from helpers.boards import floor_of_noise, observe_exactly, render_board, ring
 
-from hybridve.calib.calibrate import CameraInput, Observations, observe_board, solve_rig
+from hybridve.calib.board import Observations
+from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.image_io import open_source
+from hybridve.calib.observe import CameraInput, observe_boards
 from hybridve.calib.pose import compose
 from hybridve.calib.target import Chessboard, detect_corners
 
@@ -36,20 +38,22 @@ def horseman_inputs(recordings: Path) -> list[CameraInput]:
 
 @pytest.fixture(scope="session")
 def horseman_seen(horseman_inputs: list[CameraInput]) -> list[Observations]:
-    return observe_board(HORSEMAN, horseman_inputs)
+    return observe_boards([HORSEMAN], horseman_inputs)
 
 
 @pytest.mark.recording
 def bench_horseman_search(benchmark: Any, horseman_inputs: list[CameraInput]) -> None:
     """Four clips of 126 frames and 200 stills of 644x486, decoding included."""
-    seen = benchmark.pedantic(observe_board, (HORSEMAN, horseman_inputs), rounds=3)
-    benchmark.extra_info["stills_with_board"] = sum(len(view.stills.corners) for view in seen)
+    seen = benchmark.pedantic(observe_boards, ([HORSEMAN], horseman_inputs), rounds=3)
+    benchmark.extra_info["stills_with_board"] = sum(
+        sighting.instant is None for view in seen for sighting in view.sightings
+    )
 
 
 @pytest.mark.recording
 def bench_horseman_solve(benchmark: Any, horseman_seen: list[Observations]) -> None:
     """From corners to the rig, the scene around the symmetric board included."""
-    rig = benchmark.pedantic(solve_rig, (HORSEMAN, horseman_seen), rounds=3)
+    rig = benchmark.pedantic(solve_rig, ([HORSEMAN], horseman_seen), rounds=3).rig
     benchmark.extra_info["rms_px"] = rig.provenance["rms_px"]
 
 
@@ -60,7 +64,7 @@ def bench_solve(benchmark: Any, n_cameras: int, n_stills: int) -> None:
     cameras = ring(board, ["OPENCV"] * n_cameras)
     observations = observe_exactly(board, cameras, n_stills=n_stills, noise_px=0.2)
 
-    rig = benchmark.pedantic(solve_rig, (board, observations), rounds=3)
+    rig = benchmark.pedantic(solve_rig, ([board], observations), rounds=3).rig
 
     errors_m = [
         np.linalg.norm(rig[camera.name].center_world - camera.center_world) for camera in cameras

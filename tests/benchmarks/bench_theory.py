@@ -246,6 +246,11 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                 fmt=marker,
                 **{"ms": 4, "color": color, "mfc": face, "elinewidth": 0.6, "zorder": 3},
             )
+            left.hlines(
+                row[f"{kind}_by_bound"][0],
+                *(index - 0.38, index + 0.38),
+                **{"color": color, "lw": 1.2, "ls": "-" if kind == "place" else ":"},
+            )
         label = row["case"].split(", ")
         noise = f"{row['noise_px']:g} px"
         what = "moved board" if "moved" in row["case"] else "still board"
@@ -261,14 +266,14 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     left.axhline(1.1, color="grey", lw=1, ls="--")
     left.set_xticks(range(len(rows)), labels, fontsize=8)
     left.set(ylim=(0.78, 1.28), ylabel="rms error / least possible (Cramér-Rao)")
-    left.set_title("One mark a camera: ● place, △ turn", fontsize=10)
+    left.set_title("One mark a camera, and their mean: ● — place, △ ··· turn", fontsize=10)
     right.axhspan(93, 97, color="tab:green", alpha=0.15, lw=0)
     right.axvline(1.0, color="black", lw=1)
     right.axhline(95, color="grey", lw=0.8, ls="--")
     right.set(
         xlabel="error of a point / stated 95 % radius",
         ylabel="calibrations below, %",
-        xlim=(0, 2),
+        xlim=(0, 1.6),
         ylim=(0, 100),
     )
     right.set_title("Stated 95 %: how many were within", fontsize=10)
