@@ -12,7 +12,8 @@ corners alone calibrate
 
 Rigs are laid onto the truth by the cameras' places (rotation and shift, no scale). Errors are root
 mean squares over cameras, and their median over seeds; so is the reprojection error, of boards
-fitted to each rig. Processor time tells where the machine was busy. ``least`` is what no unbiased calibration can undercut: the Cramer-Rao bound.
+fitted to each rig. Processor time is told beside the time, for machines that are busy. ``least`` is
+what no unbiased calibration can undercut: the Cramer-Rao bound.
 aniposelib adjusts no principal points and no tangential distortion; the second lens is one that it
 can express.
 
