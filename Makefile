@@ -1,11 +1,12 @@
 # make demo    the whole job on a generated session
 # make test    everything that must hold: style, types, import contracts, tests
 # make bench   the benchmarks, with the numbers of the README
+# make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
 # make lock    renew requirements.lock after a change of pyproject.toml
 
 BIN := .venv/bin
 
-.PHONY: demo test check pytest bench lock setup clean
+.PHONY: demo test check pytest bench theory lock setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -25,6 +26,10 @@ pytest: setup
 bench: setup
 	$(BIN)/pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' \
 		--benchmark-columns=median,iqr,min,rounds --benchmark-sort=fullname
+
+theory: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/bench_theory.py --processes 2 \
+		-o data/pictures/theory.png
 
 lock: setup
 	$(BIN)/python -m pip install --quiet uv

@@ -111,8 +111,8 @@ def main() -> None:
             n_seeds = max(2, round(arguments.seeds * case.share))
             for row in calibrate_often(case, n_seeds, arguments.processes):
                 rows[case.label] = row
-                ordered = [rows[one.label] for one in CASES if one.label in rows]
-                path.write_text(json.dumps(ordered, indent=1) + "\n")
+                ordered = [json.dumps(rows[one.label]) for one in CASES if one.label in rows]
+                path.write_text("[\n" + ",\n".join(ordered) + "\n]\n")
             tell(rows[case.label])
     draw([rows[case.label] for case in CASES if case.label in rows], arguments.output)
 
