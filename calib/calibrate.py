@@ -368,9 +368,31 @@ def _synchronised(
             for name, std in clocks.std_frames.items()
         },
         "notes": list(clocks.notes),
+        "views_left_out": {name: list(instants) for name, instants in clocks.left_out.items()},
     }
     for note in clocks.notes:
-        logger.warning("clocks: %s", note)
+        logger.warning("clocks: %s; it is taken to be in time", note)
+    for name, instants in clocks.left_out.items():
+        if instants:
+            logger.warning(
+                "camera %r: %d frames of the board clip show a board off its path and are not used "
+                "for clocks; the first is frame %d",
+                name,
+                len(instants),
+                instants[0],
+            )
+    late = [
+        f"{name} {offset:+.3f} +- {1.96 * clocks.std_frames[name]:.3f}"
+        for name, offset in clocks.offset_frames.items()
+        if clocks.is_known[name] and name != clocks.reference
+    ]
+    if late:
+        about["clocks"]["advice"] = (
+            f"frames by which cameras are later than {clocks.reference}: {', '.join(late)}; these "
+            "hold for the board clip; where they hold for the recording, say "
+            "offset_s = frames / fps"
+        )
+        logger.info("clocks: %s", about["clocks"]["advice"])
     return (
         resampled(observations, clocks.offset_frames, boards),
         noise_shares(observations, clocks.offset_frames),
