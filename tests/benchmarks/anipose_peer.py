@@ -19,12 +19,11 @@ def main() -> None:
     given = np.load(sys.argv[1])
     pixels = given["pixels"]  # (C, F, N, 2), NaN where a camera did not see the board
     columns, rows, square_m = int(given["columns"]), int(given["rows"]), float(given["square_m"])
-    board = Checkerboard(columns, rows, square_length=square_m)
+    # In millimetres, as its users have it: it weighs the board's shape by the unit.
+    board = Checkerboard(columns, rows, square_length=1000.0 * square_m)
     cameras = []
     for index in range(len(pixels)):
-        # Radial distortion of second order: the most that aniposelib adjusts.
-        camera = Camera(name=f"{index}", size=tuple(map(int, given["size_px"])), extra_dist=True)
-        cameras.append(camera)
+        cameras.append(Camera(name=f"{index}", size=tuple(map(int, given["size_px"]))))
     group = CameraGroup(cameras)
     detections = [
         [
@@ -44,7 +43,7 @@ def main() -> None:
     told = [
         {
             "rotation": cv2.Rodrigues(camera.get_rotation())[0].tolist(),
-            "translation": np.ravel(camera.get_translation()).tolist(),
+            "translation": (np.ravel(camera.get_translation()) / 1000.0).tolist(),
             "matrix": np.asarray(camera.get_camera_matrix()).tolist(),
             "distortion": np.ravel(camera.get_distortions()).tolist(),
         }

@@ -280,7 +280,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     right.legend(frameon=False, fontsize=7.5, loc="lower right")
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=100)
 
 
 if __name__ == "__main__":
