@@ -357,6 +357,18 @@ def _synchronised(
         )
     lenses = _fit_lenses(boards, observations, settings.lens, requests, _no_progress)
     clocks = estimate_offsets(boards, lenses, observations)
+    if any(known for name, known in clocks.is_known.items() if name != clocks.reference):
+        # A lens that one camera tells alone is a little wrong, and bends the board's path in time.
+        # All cameras together, once they agree, tell lenses better, and these the offsets.
+        in_time = resampled(observations, clocks.offset_frames, boards)
+        lenses = _fit_lenses(boards, in_time, settings.lens, requests, _no_progress)
+        linked = link_cameras(boards, lenses, in_time, is_labelled=False)
+        rough = adjust(_make_bundle(boards, lenses, linked, requests), settings.lens.loss_px)
+        lenses = [
+            replace(lens, camera=replace(camera, cam_from_world=lens.camera.cam_from_world))
+            for lens, camera in zip(lenses, rough.bundle.cameras, strict=True)
+        ]
+        clocks = estimate_offsets(boards, lenses, observations)
     about["clocks"] = {
         "reference": clocks.reference,
         "offset_frames": {
