@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.boards import observe_exactly, ring
 from helpers.bundles import BOARD, make_bundle
+from helpers.theory import placed
 from numpy.typing import NDArray
 
 from hybridve.calib.bundle import Adjusted, adjust, moved_pose
@@ -16,7 +17,6 @@ from hybridve.calib.lens import project_points
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.rig import Rig
 from hybridve.calib.uncertainty import (
-    image_derivatives,
     measure_noise,
     parameter_slices,
     pixel_covariance,
@@ -102,20 +102,6 @@ def test_points_are_placed_as_wrong_as_is_said() -> None:
         ratios.append((errors**2).sum(axis=1) / np.trace(told.covariance_m2, axis1=1, axis2=2))
     # Three axes of unlike size: at most as scattered as one degree of freedom.
     assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / N_SEEDS) / np.sqrt(2))
-
-
-def placed(rig: Rig, true: Rig, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where a rig places points that the true rig sees: least squares in its images."""
-    found = points.copy()
-    for _ in range(4):
-        information, moment = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-        for camera, true_camera in zip(rig.cameras, true.cameras, strict=True):
-            missed = project_points(true_camera, points)[0] - project_points(camera, found)[0]
-            by_point = image_derivatives(camera, found)[0]
-            information += by_point.transpose(0, 2, 1) @ by_point
-            moment += np.einsum("nij,ni->nj", by_point, missed)
-        found = found + np.linalg.solve(information, moment[..., None])[..., 0]
-    return found
 
 
 def test_gains_predict_how_a_point_moves_with_each_parameter() -> None:
