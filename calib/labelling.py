@@ -1,14 +1,15 @@
-"""Which way round each camera saw a board that looks the same when it is turned.
+"""Which way round each camera saw a board that looks the same when turned, or in a mirror.
 
 No image of such a board tells; what the cameras see around it does (`hybridve.calib.scene`), and
-corners given by hand vote with the order in which they are listed. Where the board moves, the poses
-common to all frames decide instead (`hybridve.calib.link`).
+corners given by hand vote with the order in which they are listed. The mirror image of any plain
+chessboard is a chessboard, too: a picture that is mirrored shows by the scene alone. Where the
+board moves, the poses common to all frames decide instead (`hybridve.calib.link`).
 """
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import combinations
+from dataclasses import dataclass, replace
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,16 @@ from hybridve.calib.board import Board, Observations
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens_fit import locate_board
-from hybridve.calib.pose import Pose
-from hybridve.calib.scene import choose_looks, count_agreeing, describe_scene
+from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.scene import (
+    SceneFeatures,
+    choose_looks,
+    count_agreeing,
+    describe_scene,
+    sigmas_apart,
+    with_floor,
+)
+from hybridve.calib.target import Chessboard
 
 logger = logging.getLogger(__name__)
 
@@ -29,11 +38,24 @@ _HAND_VOTES = 10.0
 #: Evidence below this many standard deviations (of counts of chance matches) is called weak.
 _WEAK_EVIDENCE = 3.0
 
+#: The scene tells that two pictures are alike, or that one of them is mirrored, from so many
+#: standard deviations on: a rig has a hundred pairs, and matches that err are not independent.
+_CLEAR_EVIDENCE = 5.0
+
+#: A picture is called mirrored if so many times more matches agree when it is flipped.
+_CLEAR_FACTOR = 2.0
+
+#: Turns of a board by a quarter; those that are none of its looks show what chance agrees to.
+_QUARTERS = 4
+
 
 def label_still_boards(
     boards: Sequence[Board], cameras: Sequence[Camera], observations: Sequence[Observations]
 ) -> tuple[list[Observations], dict[str, Any]]:
     """List the corners of still, symmetric boards in one order in all cameras.
+
+    Cameras whose pictures of the scene around a plain chessboard do not agree are tried with their
+    pictures flipped, too.
 
     Parameters
     ----------
@@ -54,23 +76,32 @@ def label_still_boards(
     Raises
     ------
     CalibrationError
-        If a lens cannot have seen the board of its clip.
+        If a lens cannot have seen the board of its clip; naming the camera, if its picture is
+        mirrored.
     """
     evidence: dict[str, Any] = {
         "looks": max(len(board.looks) for board in boards),
         "decided_by": "the board's colours or markers",
     }
     labelled = list(observations)
+    groups = _Groups(len(cameras))
     for number, board in enumerate(boards):
         seeing = [
             index for index, seen in enumerate(labelled) if _clip_corners(seen, number) is not None
         ]
-        if len(board.looks) == 1 or not seeing:
-            continue
-        looks, told = _choose(
-            board, [cameras[i] for i in seeing], [labelled[i] for i in seeing], number
+        may_be_mirrored = isinstance(board, Chessboard) and any(
+            labelled[index].picture is not None for index in seeing
         )
-        evidence |= told
+        if not seeing or not (len(board.looks) > 1 or may_be_mirrored):
+            continue
+        seen = [labelled[i] for i in seeing]
+        scenes = _Scenes(board, [cameras[i] for i in seeing], seen, number)
+        looks = [0] * len(seeing)
+        if len(board.looks) > 1:
+            looks, told = _choose(board, scenes, seen)
+            evidence |= told
+        if may_be_mirrored:
+            _refuse_mirrored(scenes, looks, seeing, groups)
         for index, look in zip(seeing, looks, strict=True):
             labelled[index] = _turned(labelled[index], number, board.looks[look])
     return labelled, evidence
@@ -97,15 +128,16 @@ def _turned(seen: Observations, board: int, order: NDArray[np.intp]) -> Observat
 
 
 def _choose(
-    board: Board, cameras: Sequence[Camera], seen: Sequence[Observations], number: int
+    board: Board, scenes: "_Scenes", seen: Sequence[Observations]
 ) -> tuple[list[int], dict[str, Any]]:
     """Choose the look of one board in each camera; return looks and evidence."""
+    cameras = scenes.cameras
     n_cameras, n_looks = len(cameras), len(board.looks)
     evidence: dict[str, Any] = {}
     looks = [0] * n_cameras
     hands = [camera.hand_look for camera in seen]
     if n_cameras > 1:
-        votes, matches = _votes_of_scene(board, cameras, seen, number)
+        votes, matches = _votes_of_scene(scenes)
         for i, j in combinations(range(n_cameras), 2):
             hand_i, hand_j = hands[i], hands[j]
             if hand_i is not None and hand_j is not None:
@@ -145,26 +177,13 @@ def _choose(
     return [(look + turn) % n_looks for look in looks], evidence
 
 
-def _votes_of_scene(
-    board: Board, cameras: Sequence[Camera], seen: Sequence[Observations], number: int
-) -> tuple[NDArray[np.float64], dict[str, list[int]]]:
+def _votes_of_scene(scenes: "_Scenes") -> tuple[NDArray[np.float64], dict[str, list[int]]]:
     """Count the matches of the scene for each pair of cameras and each look."""
-    poses = [
-        _clip_pose(board, camera, observed, number)
-        for camera, observed in zip(cameras, seen, strict=True)
-    ]
-    scenes = [
-        describe_scene(camera, pose, observed.picture, board)
-        if observed.picture is not None
-        else None
-        for camera, pose, observed in zip(cameras, poses, seen, strict=True)
-    ]
-    votes = np.zeros((len(cameras), len(cameras), len(board.looks)))
+    cameras, n_looks = scenes.cameras, len(scenes.board.looks)
+    votes = np.zeros((len(cameras), len(cameras), n_looks))
     matches = {}
     for i, j in combinations(range(len(cameras)), 2):
-        first, second = scenes[i], scenes[j]
-        if first is not None and second is not None:
-            votes[i, j] = count_agreeing(first, poses[i], second, poses[j], board)
+        votes[i, j] = scenes.agreeing(i, j)[:: _QUARTERS // n_looks]
         pair = f"{cameras[i].name} {cameras[j].name}"
         matches[pair] = [int(count) for count in votes[i, j]]
     return votes, matches
@@ -180,3 +199,254 @@ def _clip_pose(board: Board, camera: Camera, seen: Observations, number: int) ->
             "clip; were both recorded by this camera, with the same zoom?"
         )
     return located[0]
+
+
+class _Scenes:
+    """What cameras recognise around one still board, found out when it is asked for."""
+
+    def __init__(
+        self, board: Board, cameras: Sequence[Camera], seen: Sequence[Observations], number: int
+    ) -> None:
+        self.board = board
+        self.cameras = cameras
+        self.poses = [
+            _clip_pose(board, camera, observed, number)
+            for camera, observed in zip(cameras, seen, strict=True)
+        ]
+        self.has_picture = [observed.picture is not None for observed in seen]
+        self._pictures = [observed.picture for observed in seen]
+        self._turns = [_quarter_turn(board, quarters) for quarters in range(_QUARTERS)]
+        self._features: dict[tuple[int, bool, bool], SceneFeatures] = {}
+        self._counts: dict[tuple[int, int, bool, bool], NDArray[np.intp]] = {}
+
+    def agreeing(
+        self, i: int, j: int, is_flipped: bool = False, has_floor: bool = True
+    ) -> NDArray[np.intp]:
+        """Count the matches that agree if j saw the board 0 to 3 quarters ahead of i: (4,).
+
+        Parameters
+        ----------
+        i, j : int
+            Two cameras, i < j unless `is_flipped`.
+        is_flipped : bool
+            Whether the picture of j is flipped left to right first.
+        has_floor : bool
+            Whether views of the floor from above are compared, too: they take the most time.
+        """
+        if not (self.has_picture[i] and self.has_picture[j]):
+            return np.zeros(_QUARTERS, np.intp)
+        key = (i, j, is_flipped, has_floor)
+        if key not in self._counts:
+            self._counts[key] = count_agreeing(
+                self._described(i, False, has_floor),
+                self.poses[i],
+                self._described(j, is_flipped, has_floor),
+                self._pose(j, is_flipped),
+                self.board,
+                self._turns,
+            )
+        return self._counts[key]
+
+    def _pose(self, camera: int, is_flipped: bool) -> Pose:
+        pose = self.poses[camera]
+        return _unmirrored(pose, self.board) if is_flipped else pose
+
+    def _described(self, camera: int, is_flipped: bool, has_floor: bool) -> SceneFeatures:
+        key = (camera, is_flipped, has_floor)
+        if key not in self._features:
+            picture = self._pictures[camera]
+            assert picture is not None
+            about = (
+                self.cameras[camera],
+                self._pose(camera, is_flipped),
+                picture,
+                self.board,
+                is_flipped,
+            )
+            self._features[key] = (
+                with_floor(self._described(camera, is_flipped, False), *about)
+                if has_floor
+                else describe_scene(*about)
+            )
+        return self._features[key]
+
+
+def _quarter_turn(board: Board, quarters: int) -> Pose:
+    """Return the motion (3, 4) that turns a board about its middle, as `board_from_turned` does."""
+    cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[quarters]
+    rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return np.column_stack([rotation, board.center_board - rotation @ board.center_board])
+
+
+def _unmirrored(cam_from_board: Pose, board: Board) -> Pose:
+    """Return where the camera was, in some look, if its picture of a chessboard was flipped.
+
+    Of the mirrors that map the board onto itself one is taken that leaves the colours of its
+    squares, if there is one: in the mirrored picture the list started at that corner.
+    """
+    assert isinstance(board, Chessboard)
+    if board.columns % 2 == 0:
+        mirror = np.diag([-1.0, 1.0, 1.0])
+    elif board.rows % 2 == 0:
+        mirror = np.diag([1.0, -1.0, 1.0])
+    elif board.columns == board.rows:
+        mirror = np.eye(3)[[1, 0, 2]]
+    else:
+        mirror = np.diag([-1.0, 1.0, 1.0])
+    board_from_mirrored = np.column_stack(
+        [mirror, board.center_board - mirror @ board.center_board]
+    )
+    return np.diag([-1.0, 1.0, 1.0]) @ compose(cam_from_board, board_from_mirrored)
+
+
+# --- Mirrored pictures ------------------------------------------------------------------------
+
+
+class _Groups:
+    """Cameras whose pictures are known to be mirrored all or none."""
+
+    def __init__(self, n_cameras: int) -> None:
+        self._group = list(range(n_cameras))
+
+    def are_one(self, one: int, other: int) -> bool:
+        return self._group[one] == self._group[other]
+
+    def join(self, one: int, other: int) -> None:
+        old, new = self._group[other], self._group[one]
+        self._group = [new if group == old else group for group in self._group]
+
+    def among(self, cameras: Sequence[int]) -> list[list[int]]:
+        """Return the places in `cameras` of those of each group, the largest group first."""
+        groups: dict[int, list[int]] = {}
+        for place, camera in enumerate(cameras):
+            groups.setdefault(self._group[camera], []).append(place)
+        return sorted(groups.values(), key=len, reverse=True)
+
+
+def _refuse_mirrored(
+    scenes: _Scenes, looks: Sequence[int], seeing: Sequence[int], groups: _Groups
+) -> None:
+    """Refuse a picture that agrees with those of the other cameras only if it is flipped.
+
+    Parameters
+    ----------
+    scenes : _Scenes
+        What the cameras see around one board.
+    looks : sequence of int
+        The look of the board that each of them saw, by the pictures as they are.
+    seeing : sequence of int
+        Which cameras they are; `groups` counts them so.
+    groups : _Groups
+        Gains what is found out: pictures that agree as they are are both mirrored or both not.
+
+    Raises
+    ------
+    CalibrationError
+        Naming the camera.
+    """
+    quarters = [look * (_QUARTERS // len(scenes.board.looks)) for look in looks]
+    pictured = [place for place in range(len(seeing)) if scenes.has_picture[place]]
+    # The pictures themselves are mostly enough; views of the floor are drawn only if they are not,
+    # or have been to choose the looks.
+    ways = (False, True) if len(scenes.board.looks) == 1 else (True,)
+    for has_floor, (i, j) in product(ways, _nearest_first(scenes, pictured)):
+        if groups.are_one(seeing[i], seeing[j]):
+            continue
+        counts = scenes.agreeing(i, j, has_floor=has_floor).tolist()
+        agreeing = counts.pop((quarters[j] - quarters[i]) % _QUARTERS)
+        if sigmas_apart(agreeing, max(counts)) > _CLEAR_EVIDENCE:
+            groups.join(seeing[i], seeing[j])
+    parts = groups.among([seeing[place] for place in pictured])
+    parts = [[pictured[place] for place in part] for part in parts]
+    compared = []
+    for one, other in combinations(range(len(parts)), 2):
+        plain, flipped, chance = _compare_flipped(scenes, quarters, parts[one], parts[other])
+        rival = max(plain, chance)
+        sigmas = sigmas_apart(flipped, rival)
+        if sigmas > _CLEAR_EVIDENCE and flipped > _CLEAR_FACTOR * rival:
+            compared.append(_Mirrored(sigmas, one, other, plain, flipped))
+    if compared:
+        raise _mirrored_error([camera.name for camera in scenes.cameras], parts, compared)
+
+
+def _nearest_first(scenes: _Scenes, places: Sequence[int]) -> list[tuple[int, int]]:
+    """Return pairs of cameras, those first that see the board's middle from alike directions."""
+    directions = {}
+    for place in places:
+        ray = invert(scenes.poses[place])[:, 3] - scenes.board.center_board
+        directions[place] = ray / np.linalg.norm(ray)
+    return sorted(
+        combinations(places, 2), key=lambda pair: -float(directions[pair[0]] @ directions[pair[1]])
+    )
+
+
+def _compare_flipped(
+    scenes: _Scenes, quarters: Sequence[int], part: Sequence[int], other: Sequence[int]
+) -> tuple[int, int, int]:
+    """Return how many matches between two parts agree as they are, flipped, and by chance.
+
+    By chance is what agrees most when the pictures of the other part are flipped and the board is
+    turned by what is no look of it, or not the best.
+    """
+    plain = 0
+    flipped = np.zeros(_QUARTERS, np.intp)
+    for i in part:
+        for j in other:
+            first, second = min(i, j), max(i, j)
+            ahead = (quarters[second] - quarters[first]) % _QUARTERS
+            plain += int(scenes.agreeing(first, second)[ahead])
+            # In a mirror turns run backwards.
+            flipped += np.roll(scenes.agreeing(i, j, True), quarters[i] + quarters[j])
+    step = _QUARTERS // len(scenes.board.looks)
+    best = step * int(np.argmax(flipped[::step]))
+    return plain, int(flipped[best]), int(np.delete(flipped, best).max())
+
+
+@dataclass(frozen=True, slots=True)
+class _Mirrored:
+    """Two parts of the cameras that agree if the pictures of one of them are flipped."""
+
+    sigmas: float
+    one: int
+    other: int
+    plain: int
+    flipped: int
+
+
+def _mirrored_error(
+    names: Sequence[str], parts: Sequence[Sequence[int]], compared: Sequence[_Mirrored]
+) -> CalibrationError:
+    """Return what to say: of the two kinds of cameras the fewer are mirrored."""
+    surest_first = sorted(compared, key=lambda pair: -pair.sigmas)
+    side = {surest_first[0].one: False}
+    grew = True
+    while grew:
+        grew = False
+        for pair in surest_first:
+            for near, far in ((pair.one, pair.other), (pair.other, pair.one)):
+                if near in side and far not in side:
+                    side[far], grew = not side[near], True
+    across = [pair for pair in compared if pair.one in side and side[pair.one] != side[pair.other]]
+    these, those = (
+        sorted(place for part in side if side[part] == wanted for place in parts[part])
+        for wanted in (False, True)
+    )
+    few, many = sorted((these, those), key=len)
+    is_one = len(few) == 1
+    who = ", ".join(repr(names[place]) for place in few)
+    if len(few) == len(many):
+        others = ", ".join(repr(names[place]) for place in many)
+        if is_one:
+            who = f"the picture of camera {who} or of {others} seems to be mirrored"
+        else:
+            who = f"the pictures of cameras {who} or of {others} seem to be mirrored"
+    elif is_one:
+        who = f"camera {who}: its picture seems to be mirrored"
+    else:
+        who = f"cameras {who}: their pictures seem to be mirrored"
+    it = "it is" if is_one else "they are"
+    return CalibrationError(
+        f"{who}: {sum(pair.flipped for pair in across)} matches of the scene agree with the others "
+        f"if {it} flipped left to right, {sum(pair.plain for pair in across)} if not; record "
+        f"{'it' if is_one else 'them'} unmirrored"
+    )

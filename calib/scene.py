@@ -7,7 +7,7 @@ everyone should know to improve object retrieval*, CVPR 2012 (RootSIFT).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any
 
@@ -66,29 +66,39 @@ class SceneFeatures:
 
 
 def describe_scene(
-    camera: Camera, cam_from_board: Pose, image: NDArray[Any], board: Board
+    camera: Camera,
+    cam_from_board: Pose,
+    image: NDArray[Any],
+    board: Board,
+    is_mirrored: bool = False,
 ) -> SceneFeatures:
     """Find what can be recognised in a picture around a board that lies on the floor.
 
-    Features are taken from the picture itself and from the view of its floor from above, where
-    cameras on opposite sides see the same; features of the board are left out, since they are
-    the same in every one of its `Board.looks`.
+    Features of the board are left out, since they are the same in every one of its `Board.looks`;
+    those of the floor as seen from above are added by `with_floor`.
 
     Parameters
     ----------
     camera : Camera
-        Its lens is used, its pose is not.
+        Its lens, as the picture is, is used; its pose is not.
     cam_from_board : (3, 4) float64
-        The camera's pose in any look of the board.
+        The camera's pose in any look of the board; if `is_mirrored`, after the picture is flipped.
     image : (H, W) or (H, W, 3) uint8 or float32
         The picture, 0 to 255.
     board : Board
         The board.
+    is_mirrored : bool
+        Whether the picture is to be flipped left to right before anything is recognised in it.
     """
     grey = np.clip(np.round(grey_of(image)), 0, 255).astype(np.uint8)
     focal_px = float(camera.pinhole[0, 0])
-    pixels, descriptors = _features(grey)
+    pixels, descriptors = _features(np.ascontiguousarray(grey[:, ::-1]) if is_mirrored else grey)
+    if is_mirrored:
+        # A flipped lens is no lens of its model: the lens is asked where the picture was taken.
+        pixels = pixels * [-1.0, 1.0] + [grey.shape[1], 0.0]
     rays = cam_from_img(camera, pixels) if len(pixels) else np.zeros((0, 2))
+    if is_mirrored:
+        rays = rays * [-1.0, 1.0]
     keep = np.isfinite(rays).all(axis=1)
     rays, descriptors = rays[keep], descriptors[keep]
     # Where a ray meets the plane of the board.
@@ -97,8 +107,27 @@ def describe_scene(
     with np.errstate(divide="ignore", invalid="ignore"):
         hits = center + (-center[2] / directions[:, 2])[:, None] * directions
     keep = ~((directions[:, 2] < 0) & _on_board(hits[:, :2], board))
+    return SceneFeatures(rays[keep], descriptors[keep], np.zeros((0, 2)), descriptors[:0], focal_px)
+
+
+def with_floor(
+    scene: SceneFeatures,
+    camera: Camera,
+    cam_from_board: Pose,
+    image: NDArray[Any],
+    board: Board,
+    is_mirrored: bool = False,
+) -> SceneFeatures:
+    """Return a scene with features of its floor as seen from above.
+
+    There cameras on opposite sides see the same. The parameters are those of `describe_scene`.
+    """
+    grey = np.clip(np.round(grey_of(image)), 0, 255).astype(np.uint8)
+    if is_mirrored:
+        # The camera as it took the picture: its view from above is drawn the right way round.
+        cam_from_board = np.diag([-1.0, 1.0, 1.0]) @ cam_from_board
     floor_points, floor_descriptors = _floor_features(camera, cam_from_board, grey, board)
-    return SceneFeatures(rays[keep], descriptors[keep], floor_points, floor_descriptors, focal_px)
+    return replace(scene, floor_points=floor_points, floor_descriptors=floor_descriptors)
 
 
 def _features(
@@ -127,8 +156,13 @@ def _floor_features(
     reach_m = _FLOOR_DIAGONALS * 2.0 * float(np.linalg.norm(board.center_board))
     steps = ((np.arange(_FLOOR_PIXELS) + 0.5) / _FLOOR_PIXELS * 2.0 - 1.0) * reach_m
     x, y = np.meshgrid(steps, steps)
-    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + board.center_board
-    points_cam = transform(cam_from_board, points)
+    points = np.column_stack([x.ravel(), y.ravel()]) + board.center_board[:2]
+    points_cam = np.column_stack(
+        [
+            from_x * points[:, 0] + from_y * points[:, 1] + shift
+            for from_x, from_y, _, shift in cam_from_board
+        ]
+    )
     seen = points_cam[:, 2] > 0.1 * reach_m
     pixels = np.full((len(points), 2), -1e3)
     pixels[seen] = img_from_cam(camera, points_cam[seen])
@@ -144,7 +178,7 @@ def _floor_features(
     shape = (_FLOOR_PIXELS, _FLOOR_PIXELS)
     map_x, map_y = (pixels[:, axis].reshape(shape).astype(np.float32) - 0.5 for axis in (0, 1))
     view = np.asarray(cv2.remap(grey, map_x, map_y, cv2.INTER_LINEAR), np.uint8)
-    on_board = _on_board(points[:, :2], board)
+    on_board = _on_board(points, board)
     usable = (seen & ~on_board).reshape(shape).astype(np.uint8) * np.uint8(255)
     mask = np.asarray(cv2.erode(usable, np.ones((9, 9), np.uint8), borderValue=0), np.uint8)
     places, descriptors = _features(view, mask)
@@ -157,6 +191,7 @@ def count_agreeing(
     second: SceneFeatures,
     second_from_board: Pose,
     board: Board,
+    turns: Sequence[Pose] | None = None,
 ) -> NDArray[np.intp]:
     """Count, for each look of the board, the matches that agree with two cameras' poses.
 
@@ -168,19 +203,21 @@ def count_agreeing(
         Their poses, each in some look of the board.
     board : Board
         The board.
+    turns : sequence of (3, 4) float64, optional
+        Turns of the board that are tried; default: those of its looks.
 
     Returns
     -------
     counts : (L,) int
         Matches that agree if the second camera's look is ahead of the first one's by 0, 1, ...
-        Wrong looks collect chance agreements only.
+        turns. Wrong looks collect chance agreements only.
     """
-    looks = len(board.looks)
-    counts = np.zeros(looks, dtype=np.intp)
+    if turns is None:
+        turns = [board.board_from_turned(look) for look in range(len(board.looks))]
+    counts = np.zeros(len(turns), dtype=np.intp)
     near, far = _mutual_matches(first.descriptors, second.descriptors)
     on_floor, on_other_floor = _mutual_matches(first.floor_descriptors, second.floor_descriptors)
-    for look in range(looks):
-        turned = board.board_from_turned(look)
+    for look, turned in enumerate(turns):
         pose = compose(second_from_board, turned)
         counts[look] += int(
             _agree(
@@ -307,7 +344,7 @@ def _surest_tree(votes: NDArray[np.float64]) -> list[tuple[int, int]]:
 
     def lead(pair: tuple[int, int]) -> float:
         ranked = np.sort(votes[pair])
-        return _sigmas(ranked[-1], ranked[-2])
+        return sigmas_apart(ranked[-1], ranked[-2])
 
     part = list(range(len(votes)))
     tree = []
@@ -339,7 +376,7 @@ def _total(votes: NDArray[np.float64], looks: Sequence[int]) -> float:
     return float(sum(votes[i, j, (looks[j] - looks[i]) % votes.shape[2]] for i, j in pairs))
 
 
-def _sigmas(more: float, less: float) -> float:
+def sigmas_apart(more: float, less: float) -> float:
     """Return by how many standard deviations two counts differ (Poisson)."""
     return float((more - less) / np.sqrt(more + less + 1.0))
 
@@ -353,4 +390,4 @@ def _margin(votes: NDArray[np.float64], looks: Sequence[int], side: set[int]) ->
         return float(sum(votes[i, j, (candidate[j] - candidate[i]) % n_looks] for i, j in across))
 
     rival = max(count(_turned(looks, side, ahead, n_looks)) for ahead in range(1, n_looks))
-    return _sigmas(count(looks), rival)
+    return sigmas_apart(count(looks), rival)
