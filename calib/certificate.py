@@ -24,6 +24,7 @@ from hybridve.calib.uncertainty import (
     parameter_slices,
     pixel_covariance,
     point_errors,
+    point_gains,
     radius95,
 )
 
@@ -53,6 +54,9 @@ _IMAGE_PLACES = 9
 
 #: A parameter is to blame for an unsure image if knowing it removes this share of the variance.
 _MATTERS = 0.25
+
+#: Points of the volume by which causes are compared.
+_LIMIT_POINTS = 60
 
 #: A single cause is named if without it the error were smaller by this factor.
 _BETTER = 0.8
@@ -335,20 +339,23 @@ def find_limit(rig: Rig, volume: Volume) -> Limit | None:
     """
     assert rig.covariance is not None
     matrix = rig.covariance.matrix
-    chosen = np.linspace(0, len(volume.points_world) - 1, 60).round().astype(int)
-    points = volume.points_world[np.unique(chosen)]
-    best: tuple[float, Camera, str] | None = None
+    chosen = np.linspace(0, len(volume.points_world) - 1, _LIMIT_POINTS).round().astype(int)
+    gains, _ = point_gains(rig, volume.points_world[np.unique(chosen)])
+    gains = gains[np.isfinite(gains).all(axis=(1, 2))]
+    if not len(gains):
+        return None
+    best: tuple[float, Camera, str, NDArray[np.intp]] | None = None
     for camera, span in zip(rig.cameras, parameter_slices(rig.cameras), strict=True):
         for what, columns in _groups(camera).items():
             known = span.start + np.array(columns)
-            error_m = _median_error(rig, points, _if_known(matrix, known))
+            left = _if_known(matrix, known)
+            variance = np.einsum("nip,pq,niq->n", gains, left, gains, optimize=True)
+            error_m = float(np.median(variance))
             if best is None or error_m < best[0]:
-                best = (error_m, camera, what)
-    if best is None or not np.isfinite(best[0]):
+                best = (error_m, camera, what, known)
+    if best is None:
         return None
-    _, camera, what = best
-    span = parameter_slices(rig.cameras)[rig.cameras.index(camera)]
-    known = span.start + np.array(_groups(camera)[what])
+    _, camera, what, known = best
     errors_m = point_errors(rig, volume.points_world, _if_known(matrix, known)).radius95_m
     left_m = float(np.nanquantile(errors_m, _SHARE))
     return Limit(camera.name, what, left_m, _ADVICE[what])
@@ -371,11 +378,6 @@ def _if_known(matrix: NDArray[np.float64], known: NDArray[np.intp]) -> NDArray[n
     left[known] = 0.0
     left[:, known] = 0.0
     return np.asarray(left * np.outer(scale, scale))
-
-
-def _median_error(rig: Rig, points: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
-    variance = np.trace(point_errors(rig, points, matrix).covariance_m2, axis1=1, axis2=2)
-    return float(np.sqrt(np.nanmedian(np.maximum(variance, 0.0))))
 
 
 def _certify_camera(

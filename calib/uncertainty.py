@@ -45,10 +45,10 @@ _PRIOR_DISTORTION = 10.0
 _POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 #: Points on an octant of the sphere over which `radius95` integrates, a side.
-_SPHERE_POINTS = 24
+_SPHERE_POINTS = 16
 
 #: Entries a side of the table from which `radius95` reads, linearly between them.
-_TABLE_POINTS = 33
+_TABLE_POINTS = 25
 
 #: Rays at less than a millionth of a radian are one, and place no point: the share of the largest
 #: eigenvalue of what they tell of it that the smallest must reach.
