@@ -1,4 +1,4 @@
-"""The command line."""
+"""The command line: parse, call one function, print."""
 
 import os
 
