@@ -21,6 +21,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens_fit import locate_board
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.scene import (
+    MAX_FEATURES,
     SceneFeatures,
     choose_looks,
     count_agreeing,
@@ -44,6 +45,12 @@ _CLEAR_EVIDENCE = 5.0
 
 #: A picture is called mirrored if so many times more matches agree when it is flipped.
 _CLEAR_FACTOR = 2.0
+
+#: Whether a picture is mirrored is asked of so many pairs of each camera, the nearest first, and,
+#: where nothing else is, of so many features: the answer must be quick where pictures agree, and
+#: not take long where none do.
+_TRIES = 3
+_FEATURES = 1000
 
 #: Turns of a board by a quarter; those that are none of its looks show what chance agrees to.
 _QUARTERS = 4
@@ -89,10 +96,17 @@ def label_still_boards(
         seeing = [
             index for index, seen in enumerate(labelled) if _clip_corners(seen, number) is not None
         ]
-        may_be_mirrored = isinstance(board, Chessboard) and any(
-            labelled[index].picture is not None for index in seeing
-        )
-        if not seeing or not (len(board.looks) > 1 or may_be_mirrored):
+        may_be_mirrored = isinstance(board, Chessboard)
+        if len(board.looks) == 1:
+            # Only pictures are asked for; what a lens cannot have seen is told when it is linked.
+            seeing = [
+                index
+                for index in seeing
+                if may_be_mirrored
+                and labelled[index].picture is not None
+                and _located(board, cameras[index], labelled[index], number) is not None
+            ]
+        if not seeing:
             continue
         seen = [labelled[i] for i in seeing]
         scenes = _Scenes(board, [cameras[i] for i in seeing], seen, number)
@@ -190,15 +204,20 @@ def _votes_of_scene(scenes: "_Scenes") -> tuple[NDArray[np.float64], dict[str, l
 
 
 def _clip_pose(board: Board, camera: Camera, seen: Observations, number: int) -> Pose:
-    corners = _clip_corners(seen, number)
-    assert corners is not None
-    located = locate_board(camera, board.points_board, corners)
-    if located is None:
+    pose = _located(board, camera, seen, number)
+    if pose is None:
         raise CalibrationError(
             f"camera {camera.name!r}: the lens fitted to its stills cannot have seen the board "
             "clip; were both recorded by this camera, with the same zoom?"
         )
-    return located[0]
+    return pose
+
+
+def _located(board: Board, camera: Camera, seen: Observations, number: int) -> Pose | None:
+    corners = _clip_corners(seen, number)
+    assert corners is not None
+    located = locate_board(camera, board.points_board, corners)
+    return None if located is None else located[0]
 
 
 class _Scenes:
@@ -215,6 +234,7 @@ class _Scenes:
         ]
         self.has_picture = [observed.picture is not None for observed in seen]
         self._pictures = [observed.picture for observed in seen]
+        self._max_features = _FEATURES if len(board.looks) == 1 else MAX_FEATURES
         self._turns = [_quarter_turn(board, quarters) for quarters in range(_QUARTERS)]
         self._features: dict[tuple[int, bool, bool], SceneFeatures] = {}
         self._counts: dict[tuple[int, int, bool, bool], NDArray[np.intp]] = {}
@@ -262,6 +282,7 @@ class _Scenes:
                 picture,
                 self.board,
                 is_flipped,
+                self._max_features,
             )
             self._features[key] = (
                 with_floor(self._described(camera, is_flipped, False), *about)
@@ -348,19 +369,29 @@ def _refuse_mirrored(
     pictured = [place for place in range(len(seeing)) if scenes.has_picture[place]]
     # The pictures themselves are mostly enough; views of the floor are drawn only if they are not,
     # or have been to choose the looks.
-    ways = (False, True) if len(scenes.board.looks) == 1 else (True,)
-    for has_floor, (i, j) in product(ways, _nearest_first(scenes, pictured)):
-        if groups.are_one(seeing[i], seeing[j]):
-            continue
-        counts = scenes.agreeing(i, j, has_floor=has_floor).tolist()
-        agreeing = counts.pop((quarters[j] - quarters[i]) % _QUARTERS)
-        if sigmas_apart(agreeing, max(counts)) > _CLEAR_EVIDENCE:
-            groups.join(seeing[i], seeing[j])
+    unlike: list[tuple[int, int]] = []
+    for has_floor in (False, True) if len(scenes.board.looks) == 1 else (True,):
+        unlike = []
+        tries = dict.fromkeys(pictured, 0)
+        for i, j in _nearest_first(scenes, pictured):
+            if groups.are_one(seeing[i], seeing[j]) or min(tries[i], tries[j]) >= _TRIES:
+                continue
+            counts = scenes.agreeing(i, j, has_floor=has_floor).tolist()
+            agreeing = counts.pop((quarters[j] - quarters[i]) % _QUARTERS)
+            if sigmas_apart(agreeing, max(counts)) > _CLEAR_EVIDENCE:
+                groups.join(seeing[i], seeing[j])
+            else:
+                unlike.append((i, j))
+                tries[i] += 1
+                tries[j] += 1
     parts = groups.among([seeing[place] for place in pictured])
     parts = [[pictured[place] for place in part] for part in parts]
     compared = []
     for one, other in combinations(range(len(parts)), 2):
-        plain, flipped, chance = _compare_flipped(scenes, quarters, parts[one], parts[other])
+        pairs = [
+            (i, j) for i, j in product(parts[one], parts[other]) if (min(i, j), max(i, j)) in unlike
+        ]
+        plain, flipped, chance = _compare_flipped(scenes, quarters, pairs)
         rival = max(plain, chance)
         sigmas = sigmas_apart(flipped, rival)
         if sigmas > _CLEAR_EVIDENCE and flipped > _CLEAR_FACTOR * rival:
@@ -381,22 +412,21 @@ def _nearest_first(scenes: _Scenes, places: Sequence[int]) -> list[tuple[int, in
 
 
 def _compare_flipped(
-    scenes: _Scenes, quarters: Sequence[int], part: Sequence[int], other: Sequence[int]
+    scenes: _Scenes, quarters: Sequence[int], pairs: Sequence[tuple[int, int]]
 ) -> tuple[int, int, int]:
-    """Return how many matches between two parts agree as they are, flipped, and by chance.
+    """Return how many matches of pairs agree as they are, the second flipped, and by chance.
 
-    By chance is what agrees most when the pictures of the other part are flipped and the board is
-    turned by what is no look of it, or not the best.
+    By chance is what agrees most when the second pictures are flipped and the board is turned by
+    what is no look of it, or not the best.
     """
     plain = 0
     flipped = np.zeros(_QUARTERS, np.intp)
-    for i in part:
-        for j in other:
-            first, second = min(i, j), max(i, j)
-            ahead = (quarters[second] - quarters[first]) % _QUARTERS
-            plain += int(scenes.agreeing(first, second)[ahead])
-            # In a mirror turns run backwards.
-            flipped += np.roll(scenes.agreeing(i, j, True), quarters[i] + quarters[j])
+    for i, j in pairs:
+        first, second = min(i, j), max(i, j)
+        ahead = (quarters[second] - quarters[first]) % _QUARTERS
+        plain += int(scenes.agreeing(first, second)[ahead])
+        # In a mirror turns run backwards.
+        flipped += np.roll(scenes.agreeing(i, j, True), quarters[i] + quarters[j])
     step = _QUARTERS // len(scenes.board.looks)
     best = step * int(np.argmax(flipped[::step]))
     return plain, int(flipped[best]), int(np.delete(flipped, best).max())

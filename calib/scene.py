@@ -22,7 +22,7 @@ from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.target import grey_of
 
 #: Features kept of one picture, the strongest first; matching is quadratic in them.
-_MAX_FEATURES = 3000
+MAX_FEATURES = 3000
 _MIN_CONTRAST = 0.02
 
 #: A match agrees with two poses when it misses its epipolar line by less than this (pixels), and
@@ -71,6 +71,7 @@ def describe_scene(
     image: NDArray[Any],
     board: Board,
     is_mirrored: bool = False,
+    max_features: int = MAX_FEATURES,
 ) -> SceneFeatures:
     """Find what can be recognised in a picture around a board that lies on the floor.
 
@@ -89,10 +90,13 @@ def describe_scene(
         The board.
     is_mirrored : bool
         Whether the picture is to be flipped left to right before anything is recognised in it.
+    max_features : int
+        Features kept, the strongest first.
     """
     grey = np.clip(np.round(grey_of(image)), 0, 255).astype(np.uint8)
     focal_px = float(camera.pinhole[0, 0])
-    pixels, descriptors = _features(np.ascontiguousarray(grey[:, ::-1]) if is_mirrored else grey)
+    upright = np.ascontiguousarray(grey[:, ::-1]) if is_mirrored else grey
+    pixels, descriptors = _features(upright, max_features)
     if is_mirrored:
         # A flipped lens is no lens of its model: the lens is asked where the picture was taken.
         pixels = pixels * [-1.0, 1.0] + [grey.shape[1], 0.0]
@@ -117,6 +121,7 @@ def with_floor(
     image: NDArray[Any],
     board: Board,
     is_mirrored: bool = False,
+    max_features: int = MAX_FEATURES,
 ) -> SceneFeatures:
     """Return a scene with features of its floor as seen from above.
 
@@ -126,15 +131,17 @@ def with_floor(
     if is_mirrored:
         # The camera as it took the picture: its view from above is drawn the right way round.
         cam_from_board = np.diag([-1.0, 1.0, 1.0]) @ cam_from_board
-    floor_points, floor_descriptors = _floor_features(camera, cam_from_board, grey, board)
+    floor_points, floor_descriptors = _floor_features(
+        camera, cam_from_board, grey, board, max_features
+    )
     return replace(scene, floor_points=floor_points, floor_descriptors=floor_descriptors)
 
 
 def _features(
-    grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None
+    grey: NDArray[np.uint8], max_features: int, mask: NDArray[np.uint8] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return places (K, 2), pixel centre at 0.5, and RootSIFT descriptors (K, 128)."""
-    sift: Any = cv2.SIFT.create(_MAX_FEATURES, contrastThreshold=_MIN_CONTRAST)
+    sift: Any = cv2.SIFT.create(max_features, contrastThreshold=_MIN_CONTRAST)
     points, descriptors = sift.detectAndCompute(grey, mask)
     if not points:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -151,7 +158,11 @@ def _on_board(points: NDArray[np.float64], board: Board) -> NDArray[np.bool_]:
 
 
 def _floor_features(
-    camera: Camera, cam_from_board: Pose, grey: NDArray[np.uint8], board: Board
+    camera: Camera,
+    cam_from_board: Pose,
+    grey: NDArray[np.uint8],
+    board: Board,
+    max_features: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     reach_m = _FLOOR_DIAGONALS * 2.0 * float(np.linalg.norm(board.center_board))
     steps = ((np.arange(_FLOOR_PIXELS) + 0.5) / _FLOOR_PIXELS * 2.0 - 1.0) * reach_m
@@ -181,7 +192,7 @@ def _floor_features(
     on_board = _on_board(points, board)
     usable = (seen & ~on_board).reshape(shape).astype(np.uint8) * np.uint8(255)
     mask = np.asarray(cv2.erode(usable, np.ones((9, 9), np.uint8), borderValue=0), np.uint8)
-    places, descriptors = _features(view, mask)
+    places, descriptors = _features(view, max_features, mask)
     return (places / _FLOOR_PIXELS * 2.0 - 1.0) * reach_m + board.center_board[:2], descriptors
 
 
