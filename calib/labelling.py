@@ -269,7 +269,10 @@ class _Scenes:
 
     def _pose(self, camera: int, is_flipped: bool) -> Pose:
         pose = self.poses[camera]
-        return _unmirrored(pose, self.board) if is_flipped else pose
+        if not is_flipped:
+            return pose
+        assert isinstance(self.board, Chessboard)
+        return unmirrored(pose, self.board)
 
     def _described(self, camera: int, is_flipped: bool, has_floor: bool) -> SceneFeatures:
         key = (camera, is_flipped, has_floor)
@@ -299,13 +302,27 @@ def _quarter_turn(board: Board, quarters: int) -> Pose:
     return np.column_stack([rotation, board.center_board - rotation @ board.center_board])
 
 
-def _unmirrored(cam_from_board: Pose, board: Board) -> Pose:
-    """Return where the camera was, in some look, if its picture of a chessboard was flipped.
+# --- Mirrored pictures ------------------------------------------------------------------------
+
+
+def unmirrored(cam_from_board: Pose, board: Chessboard) -> Pose:
+    """Return where a camera is whose picture of a still chessboard was mirrored left to right.
 
     Of the mirrors that map the board onto itself one is taken that leaves the colours of its
     squares, if there is one: in the mirrored picture the list started at that corner.
+
+    Parameters
+    ----------
+    cam_from_board : (3, 4) float64
+        Where it seems to be, by corners listed as of a picture that is not mirrored.
+    board : Chessboard
+        The board.
+
+    Returns
+    -------
+    cam_from_board : (3, 4) float64
+        Where it is, in one of the board's looks.
     """
-    assert isinstance(board, Chessboard)
     if board.columns % 2 == 0:
         mirror = np.diag([-1.0, 1.0, 1.0])
     elif board.rows % 2 == 0:
@@ -318,9 +335,6 @@ def _unmirrored(cam_from_board: Pose, board: Board) -> Pose:
         [mirror, board.center_board - mirror @ board.center_board]
     )
     return np.diag([-1.0, 1.0, 1.0]) @ compose(cam_from_board, board_from_mirrored)
-
-
-# --- Mirrored pictures ------------------------------------------------------------------------
 
 
 class _Groups:
