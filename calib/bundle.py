@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from hybridve.calib.board import is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.lens import img_from_cam
+from hybridve.calib.lens import img_by_params, img_from_cam
 from hybridve.calib.pose import Pose, transform
 
 #: Parameters of a pose.
@@ -462,25 +462,17 @@ def lens_derivatives(
     by_parameter : (S, 2, P) float64
         Pixels a unit of each parameter. Both by central differences, relative error about 1e-9.
     """
-    by_point = np.zeros((len(points_cam), 2, 3))
     steps = _COORDINATE_STEP * np.linalg.norm(points_cam, axis=1)
-    for axis in range(3):
-        shift = np.zeros_like(points_cam)
-        shift[:, axis] = steps
-        difference = img_from_cam(camera, points_cam + shift) - img_from_cam(
-            camera, points_cam - shift
-        )
-        by_point[:, :, axis] = difference / (2.0 * steps[:, None])
-    by_parameter = np.zeros((len(points_cam), 2, len(camera.params)))
-    for index, value in enumerate(camera.params):
-        step = _PARAMETER_STEP * max(1.0, abs(float(value)))
-        ahead, behind = camera.params.copy(), camera.params.copy()
-        ahead[index] += step
-        behind[index] -= step
-        difference = img_from_cam(replace(camera, params=ahead), points_cam) - img_from_cam(
-            replace(camera, params=behind), points_cam
-        )
-        by_parameter[:, :, index] = difference / (ahead[index] - behind[index])
+    shifts = np.eye(3)[:, None, :] * steps[:, None]  # (3, S, 3)
+    shifted = np.concatenate([points_cam + shifts, points_cam - shifts])  # (6, S, 3)
+    images = img_from_cam(camera, shifted.reshape(-1, 3)).reshape(2, 3, len(points_cam), 2)
+    by_point = ((images[0] - images[1]) / (2.0 * steps[:, None])).transpose(1, 2, 0)
+    sizes = _PARAMETER_STEP * np.maximum(1.0, np.abs(camera.params))
+    ahead, behind = camera.params + np.diag(sizes), camera.params - np.diag(sizes)
+    images = img_by_params(camera, np.concatenate([ahead, behind]), points_cam)
+    images = images.reshape(2, len(sizes), len(points_cam), 2)
+    widths = np.diag(ahead - behind)  # as rounded
+    by_parameter = ((images[0] - images[1]) / widths[:, None, None]).transpose(1, 2, 0)
     return by_point, by_parameter
 
 

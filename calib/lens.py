@@ -81,6 +81,19 @@ def img_from_cam(camera: Camera, points_cam: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(_colmap_camera(camera).img_from_cam(np.ascontiguousarray(points_cam)))
 
 
+def img_by_params(
+    camera: Camera, params: NDArray[np.float64], points_cam: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the images (K, N, 2) of points (N, 3) for K sets of a lens's parameters, (K, P)."""
+    lens = _colmap_camera(camera)
+    points = np.ascontiguousarray(points_cam)
+    images = np.zeros((len(params), len(points), 2))
+    for index, values in enumerate(params):
+        lens.params = values
+        images[index] = lens.img_from_cam(points)
+    return images
+
+
 def cam_from_img(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rays (N, 2) at depth 1 that pixels (N, 2) see; NaN where there is none."""
     if not camera.has_distortion:

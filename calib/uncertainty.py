@@ -480,10 +480,16 @@ def pixel_covariance(rig: Rig, points_world: NDArray[np.float64]) -> NDArray[np.
     ValueError
         If the rig has no covariance.
     """
+    return _joint_covariance(
+        rig, [image_derivatives(camera, points_world)[1] for camera in rig.cameras]
+    )
+
+
+def _joint_covariance(rig: Rig, derivatives: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the covariance (N, C, 2, C, 2) of images that change so (N, 2, 6 + P) by camera."""
     matrix, slices = _matrix(rig), parameter_slices(rig.cameras)
     n_cameras = len(rig.cameras)
-    derivatives = [image_derivatives(camera, points_world)[1] for camera in rig.cameras]
-    found = np.zeros((len(points_world), n_cameras, 2, n_cameras, 2))
+    found = np.zeros((len(derivatives[0]), n_cameras, 2, n_cameras, 2))
     for i, first in enumerate(derivatives):
         for j, second in enumerate(derivatives):
             found[:, i, :, j] = first @ matrix[slices[i], slices[j]] @ second.transpose(0, 2, 1)
@@ -511,16 +517,16 @@ def undistorted_covariance(rig: Rig, point_world: NDArray[np.float64]) -> NDArra
     ValueError
         If the rig has no covariance.
     """
-    covariance = pixel_covariance(rig, point_world[None])[0]
-    for index, camera in enumerate(rig.cameras):
-        if not camera.has_distortion or not np.isfinite(covariance[index, 0, index, 0]):
-            continue
-        point_cam = transform(camera.cam_from_world, point_world[None])
-        by_ray = lens_derivatives(camera, point_cam)[0][0, :, :2] * point_cam[0, 2]
-        undistorted_from_seen = camera.pinhole[:2, :2] @ np.linalg.inv(by_ray)
-        covariance[index] = np.tensordot(undistorted_from_seen, covariance[index], axes=1)
-        covariance[:, :, index] = covariance[:, :, index] @ undistorted_from_seen.T
-    return np.asarray(covariance)
+    derivatives = []
+    for camera in rig.cameras:
+        by_point, by_parameter = image_derivatives(camera, point_world[None])
+        if camera.has_distortion and np.isfinite(by_point).all():
+            rotation, shift = camera.cam_from_world[:, :3], camera.cam_from_world[:, 3]
+            depth_m = rotation[2] @ point_world + shift[2]
+            by_ray = (by_point[0] @ rotation.T)[:, :2] * depth_m
+            by_parameter = camera.pinhole[:2, :2] @ np.linalg.inv(by_ray) @ by_parameter
+        derivatives.append(by_parameter)
+    return np.asarray(_joint_covariance(rig, derivatives)[0])
 
 
 def _matrix(rig: Rig) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybridve.calib.bundle import Adjusted, adjust, moved_pose
 from hybridve.calib.calibrate import CalibrationSettings, solve_rig
 from hybridve.calib.camera import Camera
-from hybridve.calib.lens import project_points
+from hybridve.calib.lens import cam_from_img, project_points
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.rig import Rig
 from hybridve.calib.uncertainty import (
@@ -24,6 +24,7 @@ from hybridve.calib.uncertainty import (
     point_gains,
     radius95,
     rig_covariance,
+    undistorted_covariance,
 )
 from hybridve.calib.world import Mark
 
@@ -129,17 +130,17 @@ def changed(camera: Camera, column: int, step: float) -> Camera:
     return replace(camera, params=params)
 
 
-def test_the_pixel_covariance_is_that_of_the_images_of_disturbed_rigs() -> None:
-    _, rig = calibrations()[0]
+def images_of_disturbed_rigs(
+    rig: Rig, point: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Return where a point is seen by rigs drawn from a rig's covariance: (count, C, 2) pixels."""
     assert rig.covariance is not None
-    point = BOARD.center_board[None] + [[0.1, 0.1, 0.3]]
-    told = pixel_covariance(rig, point)[0].reshape(6, 6)
     factor = np.linalg.cholesky(
         rig.covariance.matrix + 1e-30 * np.diag(np.diag(rig.covariance.matrix))
     )
     rng = np.random.default_rng(0)
     images = []
-    for _ in range(4000):
+    for _ in range(count):
         change = factor @ rng.normal(size=len(factor))
         pixels = []
         for camera, span in zip(rig.cameras, parameter_slices(rig.cameras), strict=True):
@@ -149,10 +150,42 @@ def test_the_pixel_covariance_is_that_of_the_images_of_disturbed_rigs() -> None:
                 params=camera.params + change[span][6:],
             )
             pixels.append(project_points(other, point)[0][0])
-        images.append(np.concatenate(pixels))
-    found = np.cov(np.array(images).T)
+        images.append(pixels)
+    return np.array(images)
+
+
+def assert_covariance(found: NDArray[np.float64], told: NDArray[np.float64], count: int) -> None:
     scale = np.sqrt(np.outer(np.diag(told), np.diag(told)))
-    np.testing.assert_allclose(found / scale, told / scale, atol=5.0 / np.sqrt(4000))
+    np.testing.assert_allclose(found / scale, told / scale, atol=5.0 / np.sqrt(count))
+
+
+def test_the_pixel_covariance_is_that_of_the_images_of_disturbed_rigs() -> None:
+    _, rig = calibrations()[0]
+    point = BOARD.center_board[None] + [[0.1, 0.1, 0.3]]
+
+    told = pixel_covariance(rig, point)[0].reshape(6, 6)
+
+    images = images_of_disturbed_rigs(rig, point, 3000)
+    assert_covariance(np.cov(images.reshape(3000, 6).T), told, 3000)
+
+
+def test_the_same_holds_in_images_freed_of_distortion() -> None:
+    _, rig = calibrations()[0]
+    point = BOARD.center_board + np.array([0.6, 0.35, 0.2])  # where the lenses bend
+
+    told = undistorted_covariance(rig, point).reshape(6, 6)
+
+    images = images_of_disturbed_rigs(rig, point[None], 3000)
+    flat = np.stack(
+        [
+            cam_from_img(camera, images[:, index]) @ camera.pinhole[:2, :2].T
+            for index, camera in enumerate(rig.cameras)
+        ],
+        axis=1,
+    )
+    assert_covariance(np.cov(flat.reshape(3000, 6).T), told, 3000)
+    bent = pixel_covariance(rig, point[None])[0].reshape(6, 6)
+    assert np.abs(np.diag(told) / np.diag(bent) - 1.0).max() > 0.05  # it does make a difference
 
 
 def test_the_noise_of_points_is_found_out() -> None:
