@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridve.calib.calibrate import Calibration
+    from hybridve.calib.account import Calibration
     from hybridve.calib.certificate import Certificate, SeenPoints, Volume
     from hybridve.calib.check import RigCheck
     from hybridve.calib.rig import Rig

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.board import Observations, Sighting
-from hybridve.calib.calibrate import CalibrationSettings, solve_rig
+from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.clock import Clocks, estimate_offsets, resampled
 from hybridve.calib.pose import Pose, rotation_about_axes
+from hybridve.calib.settings import CalibrationSettings
 from hybridve.calib.target import Chessboard
 
 BOARD = Chessboard(7, 6, 0.05)

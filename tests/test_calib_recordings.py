@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridve.calib.board import Sighting
-from hybridve.calib.calibrate import CalibrationSettings, calibrate_rig, solve_rig
+from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.check import check_rig
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import open_source
@@ -18,6 +18,7 @@ from hybridve.calib.markers import Charuco
 from hybridve.calib.observe import CameraInput, ObserveSettings, find_boards, observe_boards
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import import_rig
+from hybridve.calib.settings import CalibrationSettings
 from hybridve.calib.target import Chessboard
 
 pytestmark = pytest.mark.recording

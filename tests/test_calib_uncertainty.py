@@ -11,11 +11,12 @@ from helpers.theory import placed
 from numpy.typing import NDArray
 
 from hybridve.calib.bundle import Adjusted, adjust, moved_pose
-from hybridve.calib.calibrate import CalibrationSettings, solve_rig
+from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, project_points
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.rig import Rig
+from hybridve.calib.settings import CalibrationSettings
 from hybridve.calib.uncertainty import (
     measure_noise,
     parameter_slices,

@@ -8,15 +8,17 @@ from dataclasses import asdict
 
 import numpy as np
 
+from hybridve.calib.account import Calibration
 from hybridve.calib.board import Board
 from hybridve.calib.boards import make_board
-from hybridve.calib.calibrate import Calibration, CalibrationSettings, calibrate_rig
+from hybridve.calib.calibrate import calibrate_rig
 from hybridve.calib.check import RigCheck, check_rig
 from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.observe import CameraInput, find_boards
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict
+from hybridve.calib.settings import CalibrationSettings
 from hybridve.calib.tracker_io import read_poses
 from hybridve.calib.world import Mark
 from hybridve.hull.capture.recording import recording_of

@@ -44,8 +44,9 @@ from helpers.theory import (
     still_scene,
 )
 
-from hybridve.calib.calibrate import CalibrationSettings, solve_rig
+from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.lens_fit import LensSettings
+from hybridve.calib.settings import CalibrationSettings
 from hybridve.calib.uncertainty import parameter_slices, point_errors
 
 N_STILLS = 20
