@@ -46,7 +46,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
     Results go to stdout, progress to stderr. Exit status: 0 done (a collision found is a result),
     1 a problem you can fix, 2 wrong usage, 3 something clashes and --fail-on-clash was given,
-    130 interrupted.
+    4 a rig is worse than --max-error-mm or does not pass --check, 130 interrupted.
     """
     level = (
         logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
