@@ -3,6 +3,8 @@
 import json
 import math
 import sys
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
@@ -332,6 +334,8 @@ def _print(numbers: dict[str, Any], certificate: "Certificate | None") -> None:
         click.echo("; ".join(parts))
         if "model_chosen" in camera:
             click.echo(f"    {camera['model_chosen']['reason']}")
+        for remark in (*camera.get("warnings", ()), *_counted(camera.get("notes", ()))):
+            click.echo(f"    {remark}")
     pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in numbers["distances_m"].items())
     if pairs:
         click.echo(f"  distances, m: {pairs}")
@@ -343,6 +347,12 @@ def _print(numbers: dict[str, Any], certificate: "Certificate | None") -> None:
     if certificate is not None:
         for warning in certificate.warnings:
             click.echo(f"  {warning}")
+
+
+def _counted(notes: Sequence[str]) -> list[str]:
+    """Return what is unusual about boards in pictures, each once: "IMAGE: what" by what."""
+    counts = Counter(note.partition(": ")[2] for note in notes)
+    return [f"{count} views: {what}" for what, count in sorted(counts.items())]
 
 
 def _print_decisions(numbers: dict[str, Any]) -> None:

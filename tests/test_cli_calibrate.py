@@ -1,7 +1,9 @@
 """``hybridve calibrate`` from end to end, on rendered pictures: files, verdicts, statuses."""
 
 import json
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from helpers.boards import board_poses, look_at, make_camera, render_board
 from helpers.recorded_boards import held_up
 from numpy.typing import NDArray
 
+from hybridve.calib.board import Detection, Effort
 from hybridve.calib.camera import Camera
 from hybridve.calib.pose import compose
 from hybridve.calib.rig_io import read_rig
@@ -180,6 +183,24 @@ def test_a_second_run_reads_no_picture_and_says_the_same(
     again = json.loads(capsys.readouterr().out)
     assert again["certificate"] == calibrated[1]["certificate"]
     assert not (out / "certificate.html").exists()
+
+
+def test_what_is_unusual_about_boards_is_told_once(
+    run: Run, capsys: Captured, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(recorded, tmp_path / "copy", ignore=shutil.ignore_patterns("rig"))
+    detect = Chessboard.detect
+
+    def detect_inverted(board: Chessboard, image: NDArray[np.uint8], effort: Effort) -> Detection:
+        return replace(detect(board, image, effort), notes=("inverted",))
+
+    monkeypatch.setattr(Chessboard, "detect", detect_inverted)
+
+    assert run("calibrate", standing(tmp_path / "copy"), "--no-page") == 0
+
+    lines = [line for line in capsys.readouterr().out.splitlines() if "inverted" in line]
+    assert len(lines) == 3  # one a camera, however many pictures
+    assert all(line.strip().endswith(" views: inverted") for line in lines)
 
 
 def test_a_rig_that_exists_is_kept_unless_told(
