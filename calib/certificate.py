@@ -517,6 +517,11 @@ def _doubts(rig: Rig) -> tuple[str, ...]:
     return tuple(doubts)
 
 
+def millimetres(length_m: float) -> str:
+    """Return a length in mm to two digits, as people write it: 0.33, 7.7, 56000."""
+    return f"{float(f'{1000 * length_m:.2g}'):.15g}"
+
+
 def _kind(parameter: str) -> str:
     return {"f": "focal length", "c": "principal point"}.get(parameter[0], "distortion")
 
@@ -526,7 +531,7 @@ def _verdict(error95_m: float, cameras: Sequence[CameraCertificate], limit: Limi
         errors = [told.error95_px for told in cameras if np.isfinite(told.error95_px)]
         known = f"images are known to {max(errors):.2f} px" if errors else "nothing is known"
         return f"no two cameras see a common volume, so no error in mm can be stated; {known}"
-    verdict = f"good to {1000 * error95_m:.2g} mm in the working volume (95 %)"
+    verdict = f"good to {millimetres(error95_m)} mm in the working volume (95 %)"
     unsure = [told for told in cameras if told.undetermined]
     if unsure:
         worst = max(unsure, key=lambda told: told.edge_error95_px)
@@ -534,7 +539,7 @@ def _verdict(error95_m: float, cameras: Sequence[CameraCertificate], limit: Limi
         return f"{verdict}; {worst.name}'s {name} is not determined: {_ADVICE[_kind(name)]}"
     if limit.error95_m < _BETTER * error95_m:
         return (
-            f"{verdict}; it would be {1000 * limit.error95_m:.2g} mm if the {limit.what} of "
+            f"{verdict}; it would be {millimetres(limit.error95_m)} mm if the {limit.what} of "
             f"{limit.camera} were known: {limit.advice}"
         )
     return verdict

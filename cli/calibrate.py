@@ -271,10 +271,12 @@ def _write_certificate(
 
 def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
     """Leave with a status of its own if the error is not proved to be small enough."""
+    from hybridve.calib.certificate import millimetres
+
     error_m = math.nan if certificate is None or certificate.doubts else certificate.error95_m
     if error_m <= max_error_m:
         return
-    found = f"{1000 * error_m:.2g} mm" if math.isfinite(error_m) else "an unknown error"
+    found = f"{millimetres(error_m)} mm" if math.isfinite(error_m) else "an unknown error"
     click.echo(
         f"error: the rig is good to {found}, not to {1000 * max_error_m:g} mm as --max-error-mm "
         "asks; it was written all the same",
@@ -313,6 +315,8 @@ def _numbers(path: Path, rig: "Rig", certificate: "Certificate | None") -> dict[
 
 
 def _print(numbers: dict[str, Any], certificate: "Certificate | None") -> None:
+    from hybridve.calib.certificate import millimetres
+
     if certificate is not None:
         click.echo(certificate.verdict)
     click.echo(f"{numbers['rig']}: {len(numbers['cameras'])} cameras")
@@ -321,7 +325,7 @@ def _print(numbers: dict[str, Any], certificate: "Certificate | None") -> None:
         x, y, z = camera["center_m"]
         place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) m"
         if camera["name"] in told:
-            place += f" +- {1000 * told[camera['name']].place_std_m:.2g} mm"
+            place += f" +- {millimetres(told[camera['name']].place_std_m)} mm"
         parts = [f"  {camera['name']}: {camera['model']}, {place}"]
         for kind, what in (("intrinsics", "stills"), ("extrinsics", "board clip")):
             found = camera.get(kind, {})
