@@ -5,12 +5,13 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from hybridve.cli import options
 from hybridve.cli.progress import StageProgress, progress_bar
+from hybridve.hull.contact.verdict import VERDICTS
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
@@ -49,13 +50,25 @@ COMPARISON = "COMPARISON.csv"
 @options.engine_option
 @options.frames_option
 @options.response_options
+@click.option(
+    "--points",
+    type=click.Choice(["sample", "all"]),
+    default="sample",
+    show_default=True,
+    help="Spell all collision points out, for programs that cannot make them from runs.",
+)
 @click.option("--resume", is_flag=True, help="Take up a run that was cut off.")
 @options.overwrite_option
 @click.option(
     "--fail-on-clash",
     is_flag=True,
-    help="Leave with status 3 if something clashes, or is certainly nearer than its required "
-    "clearance.",
+    help="Leave with status 3 unless every object is proved to keep its distance in every frame.",
+)
+@click.option(
+    "--let-pass",
+    type=click.Choice([one for one in VERDICTS if one != "kept"]),
+    multiple=True,
+    help="A verdict besides 'kept' that --fail-on-clash lets pass; may be given several times.",
 )
 @options.json_option
 @options.quiet_progress
@@ -71,6 +84,8 @@ def detect(
     resume: bool,
     overwrite: bool,
     fail_on_clash: bool,
+    let_pass: tuple[str, ...],
+    points: Literal["sample", "all"],
     as_json: bool,
     progress: bool,
     **response: Any,
@@ -112,16 +127,16 @@ def detect(
         open_at_m=open_at_mm / 1000.0 or None,
         **response,
     )
-    how = _How(settings, engine, resume, overwrite, progress)
+    how = _How(settings, engine, resume, overwrite, progress, points)
     if len(sessions) > 1 or len(scenes) > 1:
-        clashes = _detect_all(sessions, scenes, output, how, as_json=as_json)
+        clashes = _detect_all(sessions, scenes, output, how, let_pass, as_json=as_json)
     else:
         refuse_existing(output, overwrite=overwrite)
         chain = make_chain(load_session(sessions[0]), load_scene(scenes[0]), settings)
         _write_report(chain, output, how)
         report = read_report(output)
         numbers = summarize(report)
-        clashes = bool(failing(numbers))
+        clashes = bool(failing(numbers, let_pass))
         if as_json:
             click.echo(json.dumps(numbers))
         else:
@@ -139,6 +154,7 @@ class _How:
     resume: bool
     overwrite: bool
     progress: bool
+    points: Literal["sample", "all"]
 
 
 def _write_report(chain: "Chain", output: Path, how: _How) -> None:
@@ -149,7 +165,9 @@ def _write_report(chain: "Chain", output: Path, how: _How) -> None:
         computed_parts,
         count_frames,
         evaluate,
+        local_origin_m,
         resolved_settings,
+        stored_meshes,
     )
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.machine import machine_text, software_versions
@@ -168,6 +186,9 @@ def _write_report(chain: "Chain", output: Path, how: _How) -> None:
             cameras=chain.views.names,
             versions=software_versions(),
             machine=machine_text(),
+            local_origin_m=local_origin_m(chain),
+            meshes=stored_meshes(chain),
+            points=how.points,
         )
         with ReportWriter(output, header, resume=how.resume, overwrite=how.overwrite) as writer:
             total = count_frames(chain)
@@ -195,10 +216,11 @@ def _detect_all(
     scenes: tuple[Path, ...],
     folder: Path,
     how: _How,
+    let_pass: tuple[str, ...],
     *,
     as_json: bool,
 ) -> bool:
-    """Test every session against every layout; tell whether something clashes.
+    """Test every session against every layout; tell whether a distance is not kept.
 
     One that fails is told and left out, and the others go on.
     """
@@ -266,7 +288,7 @@ def _detect_all(
             f"{folder}: {len(comparison['failed'])} of {len(pairs)} reports could not be made, as "
             "told above; the others stand there, and the same call with --resume makes the rest"
         )
-    return any(failing(pair.summary) for pair in pairs if pair.summary is not None)
+    return any(failing(pair.summary, let_pass) for pair in pairs if pair.summary is not None)
 
 
 def _make_folder(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """``hybridve summary``: what a report found, as text, JSON or curves."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
 
 #: Beginnings of contact that are told of each object; the report and --json have all.
 _MOST_ENTRIES = 5
+
+#: Reasons that are told of each object.
+_MOST_WHY = 3
 
 #: Names in a list of objects.
 _MOST_NAMES = 8
@@ -68,6 +72,7 @@ def print_summary(report: "Report") -> None:
     from hybridve.hull.report.summarize import summarize
 
     numbers = summarize(report)
+    click.echo(_overall_text(numbers))
     click.echo(f"{numbers['report']}: {numbers['frames']} frames, {numbers['seconds']:.2f} s")
     if numbers["frames_invalid"]:
         invalid = options.counted(numbers["frames_invalid"], "frame")
@@ -76,18 +81,21 @@ def print_summary(report: "Report") -> None:
             click.echo(f"    {count} x {reason}")
     if numbers["frames_without_hull"]:
         empty = options.counted(numbers["frames_without_hull"], "frame")
-        click.echo(f"  {empty} without a hull: a camera saw nothing, and nothing can be touched")
-    rows = [("object", "verdict", "frames", "certain", "when", "points, most", "triangles, most")]
+        click.echo(f"  {empty} without a hull near any object, in which nothing can be touched")
+    for why, count in _rests_on(report).items():
+        click.echo(f"    {count} x {why}")
+    rows = [("object", "verdict", "frames", "certain", "when", *_MOST_OF_A_FRAME)]
     for found in numbers["objects"]:
         rows.append(
             (
                 found["name"],
                 found["verdict"],
-                f"{found['frames_colliding']}",
+                _frames_text(found["frames_by_verdict"]),
                 _certain_text(found),
                 _spans_text(found["spans"]),
                 f"{found['points_most']}",
                 f"{found['triangles_most']}",
+                f"{found['patches_most']}",
             )
         )
     options.print_table(rows)
@@ -119,6 +127,30 @@ def print_summary(report: "Report") -> None:
     click.echo(f"  ms of work a frame, mean: {stages}; engine {numbers['engine']}")
 
 
+def _overall_text(numbers: dict[str, Any]) -> str:
+    """Return the verdict on all objects in one line."""
+    every = len(numbers["objects"])
+    kept = numbers["objects_by_verdict"].get("kept", 0)
+    if kept == every:
+        whom = "the object keeps" if every == 1 else f"all {every} objects keep"
+        return f"kept: {whom} the distance"
+    found = ", ".join(f"{count} {one}" for one, count in numbers["objects_by_verdict"].items())
+    return f"{numbers['verdict']}: {kept} of {every} objects keep their distance ({found})"
+
+
+def _rests_on(report: "Report") -> dict[str, int]:
+    """Return what it rests on that frames have no hull, to how many frames it does."""
+    return dict(Counter(text for text in report.rests_on.tolist() if text))
+
+
+def _frames_text(frames_by_verdict: dict[str, int]) -> str:
+    return ", ".join(f"{count} {one}" for one, count in frames_by_verdict.items()) or "-"
+
+
+#: Columns of the largest number in any frame.
+_MOST_OF_A_FRAME = ("points, most", "triangles, most", "patches, most")
+
+
 def _print_clearances(objects: list[dict[str, Any]]) -> None:
     """Print how near each object was come to, and how deep it was reached into."""
     rows = [
@@ -146,10 +178,21 @@ def _print_clearances(objects: list[dict[str, Any]]) -> None:
                 _mm(found["required_clearance_m"]) if found["required_clearance_m"] else "-",
                 _below_text(found),
                 "-" if depth is None else _bounds_text(depth["lower_m"], depth["upper_m"]),
-                "-" if recovery is None else _mm(recovery["d_rec_m"]),
+                _recovery_text(recovery),
             )
         )
     options.print_table(rows)
+
+
+def _recovery_text(recovery: dict[str, Any] | None) -> str:
+    """Return the longest D_rec in millimetres, and in how many frames V_rec has no exit."""
+    if recovery is None:
+        return "-"
+    no_exit = f"no exit in {options.counted(recovery['frames_no_exit'], 'frame')}"
+    if recovery["d_rec_m"] is None:
+        return no_exit
+    longest = _mm(recovery["d_rec_m"])
+    return f"{longest}, {no_exit}" if recovery["frames_no_exit"] else longest
 
 
 def _print_entries(found: dict[str, Any]) -> None:
@@ -188,7 +231,19 @@ def _warnings(found: dict[str, Any]) -> list[str]:
             "what touches may hold nothing real: other volumes of the hull explain all its pixels",
         ),
     )
-    return [f"in {options.counted(count, 'frame')} {text}" for count, text in told if count]
+    lines = [f"in {options.counted(count, 'frame')} {text}" for count, text in told if count]
+    recovery = found["recovery"]
+    if recovery is not None and recovery["frames_asked_to_free"]:
+        asked, shift_m = recovery["frames_asked_to_free"], recovery["free_shift_m"]
+        whole = f"{_mm(shift_m)} mm along V_rec do in all" if shift_m is not None else "none does"
+        if recovery["frames_freed"] < asked:
+            lines.append(
+                f"moving it by D_rec frees all of it in {recovery['frames_freed']} of "
+                f"{options.counted(asked, 'frame')}; {whole}"
+            )
+    told_of = [(why, count) for why, count in found["why"].items() if why]
+    lines += [f"in {options.counted(count, 'frame')}: {why}" for why, count in told_of[:_MOST_WHY]]
+    return lines
 
 
 def _speed_text(lower_m_s: float | None, upper_m_s: float | None) -> str:

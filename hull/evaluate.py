@@ -44,12 +44,15 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
-from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
+from hybridve.hull.contact.finding import Finding, agreed, judged, signed_clearance
+from hybridve.hull.contact.patches import contact_patches
+from hybridve.hull.contact.recovery import recover
 from hybridve.hull.contact.respond import Response, ResponseSettings, respond
 from hybridve.hull.contact.scene import Scene
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
+from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.schema import FrameResult, Part
 
 if TYPE_CHECKING:
@@ -266,6 +269,8 @@ def evaluate(
                     reason=silhouettes.reason,
                     findings=findings,
                     stage_s=watch.stage_s,
+                    state="unread" if silhouettes.reason else "evaluated",
+                    object_share=() if seen is None else object_share(seen.hull),
                 )
             before = seen
             row += 1
@@ -380,6 +385,11 @@ def _findings(
             finding = replace(finding, response=_response(chain, number, seen.hull, finding))
         findings.append(finding)
     watch.lap("respond")
+    findings = [
+        _completed(chain, tools, number, seen.hull, finding)
+        for number, finding in enumerate(findings)
+    ]
+    watch.lap("patches")
     if tools.doubter is not None:
         doubts = tools.doubter.frame(seen.hull, chain.tracks.at(seen.index))
         findings = [
@@ -430,6 +440,45 @@ def _compared(
     )
 
 
+def _completed(chain: Chain, tools: _Tools, number: int, hull: Hull, finding: Finding) -> Finding:
+    """Return a finding with its verdict, its patches, and what moving the whole object does."""
+    part = chain.scene.objects[number]
+    required_m = part.required_clearance_m
+    finding = judged(
+        finding,
+        is_closed=part.is_closed,
+        required_m=required_m,
+        share_seen=np.nan,
+        rests_on="",
+    )
+    if finding.clearance is None:
+        return finding
+    meter = tools.meters[number]
+    if finding.verdict in ("clash", "inside", "too near"):
+        patches = contact_patches(
+            hull,
+            meter,
+            finding.contact,
+            required_m=required_m,
+            reference_point_world=part.reference_point_world,
+        )
+        finding = replace(finding, patches=patches)
+    if finding.response is not None and chain.settings.response is not None:
+        response = finding.response
+        reach_m = chain.settings.response.reach_m
+        recovery = recover(hull, meter, response.v_rec, response.d_rec_m, reach_m)
+        finding = replace(finding, recovery=recovery)
+    return finding
+
+
+def object_share(hull: Hull) -> tuple[float, ...]:
+    """Return the share of each camera's picture that is object."""
+    return tuple(
+        float(hull.integral(camera)[-1, -1]) / float(np.prod(size))
+        for camera, size in enumerate(hull.views.sizes_px)
+    )
+
+
 def _response(chain: Chain, number: int, hull: Hull, finding: Finding) -> Response:
     part = chain.scene.objects[number]
     begins_at = None
@@ -452,6 +501,7 @@ def computed_parts(settings: EvaluateSettings) -> frozenset[Part]:
         "clearance": has_clearance,
         "first contact": True,
         "response": settings.response is not None,
+        "recovery": has_clearance and settings.response is not None,
         "doubt": has_clearance and settings.doubt is not None,
     }
     return frozenset(part for part, is_computed in parts.items() if is_computed)
@@ -490,7 +540,8 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "mask_threshold": session.mask_threshold,
         "segmentation": asdict(session.segmentation),
         "silhouettes": None if chain.silhouettes is None else str(chain.silhouettes),
-        "local_origin_m": chain.views.origin_world.tolist(),
+        "local_origin_m": list(local_origin_m(chain)),
+        "query_origin_m": chain.views.origin_world.tolist(),
         **({"poses_sha256": dict(chain.tracks.sha256)} if chain.tracks else {}),
     }
 
@@ -532,6 +583,36 @@ def about_objects(chain: Chain) -> tuple[dict[str, Any], ...]:
         }
         for scene_object, body in zip(chain.scene.objects, chain.bodies, strict=True)
     )
+
+
+def local_origin_m(chain: Chain) -> tuple[float, float, float]:
+    """Return where the places of a report begin, (3,) metres in the world.
+
+    In whole hundreds of metres: a room about the world's origin keeps its coordinates, and one far
+    from it has places in single precision to 4 micrometres.
+    """
+    x, y, z = (float(round(at / 100.0) * 100.0) for at in chain.views.origin_world)
+    return x, y, z
+
+
+def stored_meshes(chain: Chain) -> tuple[StoredMesh, ...]:
+    """Return the objects' meshes as the report holds them."""
+    meshes = []
+    for part, body in zip(chain.scene.objects, chain.bodies, strict=True):
+        placement = part.world_from_mesh.copy()
+        placement[:, 3] -= local_origin_m(chain)
+        viewport = np.zeros(len(body.numbers), np.uint16)
+        viewport[body.numbers] = body.triangles.viewports
+        meshes.append(
+            StoredMesh(
+                part.vertices_world if part.vertices_mesh is None else part.vertices_mesh,
+                part.faces,
+                viewport,
+                body.numbers,
+                placement[None],
+            )
+        )
+    return tuple(meshes)
 
 
 def _silhouettes(

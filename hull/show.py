@@ -119,8 +119,8 @@ def _drawn_objects(shot: Shot) -> list[DrawnObject]:
             vertices_world=part.vertices_world,
             faces=part.faces,
             collides=contact.collides,
-            hit_triangles=np.unique(contact.triangle),
-            hit_points_world=contact.points_world,
+            hit_triangles=contact.triangles(),
+            hit_points_world=contact.points()[0],
         )
         for part, contact in zip(shot.chain.scene.objects, shot.contacts, strict=True)
     ]

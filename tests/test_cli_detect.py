@@ -94,8 +94,8 @@ def test_the_engines_write_the_same_points(
         path = tmp_path / f"{engine}.h5"
         assert run("detect", session, "--scene", scene, "-o", path, "--engine", engine) == 0
         with h5py.File(path) as file:
-            points = file["hybridve/objects/hit/points"]
-            found[engine] = (points["xyz_m"][:], points["triangle"][:], points["offset"][:])
+            runs = file["hybridve/objects/hit/runs"]
+            found[engine] = [runs[name][:] for name in ("triangle", "first", "count", "offset")]
 
     for native, reference in zip(found["native"], found["reference"], strict=True):
         np.testing.assert_array_equal(native, reference)
@@ -192,6 +192,22 @@ def test_status_3_tells_of_a_clash_only_if_asked(
     assert run(*clash, "-o", tmp_path / "a.h5") == 0
     assert run(*clash, "-o", tmp_path / "b.h5", "--fail-on-clash") == 3
     assert run(*clear, "-o", tmp_path / "c.h5", "--fail-on-clash") == 0
+    assert run(*clash, "-o", tmp_path / "d.h5", "--fail-on-clash", "--let-pass", "clash") == 0
+
+
+def test_a_frame_that_could_not_be_read_is_no_kept_distance(
+    run: Run, tmp_path: Path, scene: Path
+) -> None:
+    session = write_ball_session(tmp_path / "session", CENTERS[:2])
+    (tmp_path / "session" / "cam2" / "1.png").write_bytes(b"torn")
+    asked = ["detect", session, "--scene", scene, "--fail-on-clash"]
+
+    assert run(*asked, "-o", tmp_path / "a.h5") == 3
+    assert run(*asked, "-o", tmp_path / "b.h5", "--let-pass", "unknown") == 0
+
+    rows = read_report(tmp_path / "a.h5").objects["hit"]
+    assert rows.verdict.tolist() == ["kept", "unknown"]
+    assert "cam2" in rows.why[1]
 
 
 def test_something_inside_or_too_near_is_a_clash_too(
@@ -353,7 +369,7 @@ def test_summary_counts_what_the_report_holds(
     by_name = {found["name"]: found for found in numbers["objects"]}
     assert numbers["frames"] == len(CENTERS)
     assert by_name["hit"]["frames_colliding"] == report.objects["hit"].collides.sum()
-    assert by_name["far"]["verdict"] == "free"
+    assert by_name["far"]["verdict"] == "kept"
     assert run("summary", path) == 0
     text = capsys.readouterr().out
     assert "hit" in text

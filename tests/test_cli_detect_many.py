@@ -71,15 +71,15 @@ def test_every_session_is_tested_against_every_layout(
     with (folder / "COMPARISON.csv").open(encoding="utf-8", newline="") as file:
         rows = {(r["layout"], r["object"], r["quantity"]): r for r in csv.DictReader(file)}
     verdict = rows["near", "cube", "verdict"]
-    assert (verdict["ann"], verdict["bob"]) == ("free", "colliding")
+    assert (verdict["ann"], verdict["bob"]) == ("too near", "clash")
     assert rows["near", "cube", "frames_below_required"]["ann"] == "2"
     # The ball of 0.2 m comes as near as 0.5 m; its hull is bigger, and contains it.
     assert 350 < float(rows["near", "cube", "clearance_lower"]["ann"]) <= 500.0
-    assert rows["far", "other", "verdict"]["bob"] == "free"
+    assert rows["far", "other", "verdict"]["bob"] == "kept"
     line = next(line for line in told.splitlines() if line.strip().startswith("near"))
-    assert "free" in line
+    assert "too near" in line
     assert "2 frames below 1000 mm" in line
-    assert "colliding, 1 of 2 frames" in line
+    assert "clash, 1 of 2 frames" in line
 
 
 def test_a_report_of_several_is_that_of_one(

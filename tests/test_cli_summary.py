@@ -9,12 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.contacts import FREE, free_contact, stored_mesh
 from helpers.sessions import write_ball_session, write_cube_scene
 
 from hybridve.hull.contact.backtrack import FirstContact
 from hybridve.hull.contact.clearance import Clearance
-from hybridve.hull.contact.detect import Contact
-from hybridve.hull.contact.finding import Finding
+from hybridve.hull.contact.finding import Finding, judged
+from hybridve.hull.contact.recovery import Recovery
 from hybridve.hull.contact.respond import Response
 from hybridve.hull.contact.uncertainty import Doubt
 from hybridve.hull.curves import write_curves
@@ -25,8 +26,7 @@ from hybridve.hull.report.write import ReportWriter
 
 Run = Callable[..., int]
 
-FREE = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
-TOUCHING = Contact("colliding", FREE.points_world, FREE.triangle, np.ones(3))
+TOUCHING = free_contact("colliding", witness_world=np.ones(3))
 DOUBT = Doubt(0.002, 0.0, 0.05, np.zeros(2), False, 2, True, (), "real")
 
 #: When the one contact began, and how well that is known.
@@ -63,7 +63,9 @@ ENTRY = deep(
     first_contact_s=BEGAN_S,
     first_contact_uncertainty_s=BEGAN_DOUBT_S,
     approach_m_s=(0.2, 0.3),
+    recovery=Recovery("no", 0.04, 0.05),
 )
+LOST = replace(ENTRY.response, d_rec_m=np.nan, status="no exit")
 PHANTOM = replace(
     DOUBT, survives=False, hinges_on=("cam2", "cam1"), component="unsure", at_least_m=np.nan
 )
@@ -72,10 +74,14 @@ FRAMES = [
     near(9.95, 12.0),  # the bounds enclose the 10 mm that are required
     near(7.0, 3.0),
     ENTRY,
-    deep(6.0, doubt=PHANTOM),
+    deep(6.0, doubt=PHANTOM, response=LOST, recovery=Recovery("", np.nan, np.nan)),
     None,
     near(0.0, depth_mm=30.0),  # inside
 ]
+
+
+def verdict_on(finding: Finding, required_m: float) -> Finding:
+    return judged(finding, is_closed=True, required_m=required_m, share_seen=1.0, rests_on="")
 
 
 @pytest.fixture
@@ -88,14 +94,16 @@ def path(tmp_path: Path) -> Path:
         rig={},
         engine="native",
         renderer="",
-        parts=frozenset({"clearance", "first contact", "response", "doubt"}),
+        parts=frozenset({"clearance", "first contact", "response", "recovery", "doubt"}),
         cameras=("cam1", "cam2"),
+        meshes=(stored_mesh(FREE.body),),
     )
     with ReportWriter(path, header) as writer:
         for row, finding in enumerate(FRAMES):
-            findings = () if finding is None else (finding,)
+            findings = () if finding is None else (verdict_on(finding, 0.01),)
             reason = "torn" if finding is None else ""
-            writer.append(FrameResult(row + 100, row / 10, reason, findings, {}))
+            state = "unread" if finding is None else "evaluated"
+            writer.append(FrameResult(row + 100, row / 10, reason, findings, {}, state))
         writer.finish()
     return path
 
@@ -103,7 +111,15 @@ def path(tmp_path: Path) -> Path:
 def test_the_summary_counts_bounds_dates_and_names(path: Path) -> None:
     (found,) = summarize(read_report(path))["objects"]
 
-    assert found["verdict"] == "colliding"
+    assert found["verdict"] == "clash"
+    assert found["frames_by_verdict"] == {
+        "clash": 2,
+        "inside": 1,
+        "too near": 1,
+        "unknown": 1,
+        "open": 1,
+        "kept": 1,
+    }
     assert (found["frames_colliding"], found["frames_inside"]) == (2, 1)
     assert found["frames_proved_free"] == 3
     # Two touch, one is inside, one is certainly nearer than 10 mm; of another nobody can tell.
@@ -120,14 +136,18 @@ def test_the_summary_counts_bounds_dates_and_names(path: Path) -> None:
     }
     assert found["recovery"]["d_rec_m"] == 0.0123
     assert found["recovery"]["d_rec_paper_m"] == 0.0125
+    assert found["recovery"]["frames_no_exit"] == 1
+    assert found["recovery"]["frames_asked_to_free"] == 1
+    assert found["recovery"]["frames_freed"] == 0
+    assert found["recovery"]["free_shift_m"] == 0.05
     assert (found["frames_hinging"], found["hinges_on"]) == (1, ["cam1", "cam2"])
     assert found["frames_unsure"] == 1
-    first, inside = found["spans"]
-    assert (first["first_frame"], first["last_frame"]) == (103, 104)
+    # Nobody knows of frame 105; it does not tell two contacts apart.
+    (first,) = found["spans"]
+    assert (first["first_frame"], first["last_frame"]) == (103, 106)
     assert first["first_contact_s"] == BEGAN_S
     assert first["first_contact_status"] == "outline lost"
     assert first["approach_m_s"] == [0.2, 0.3]
-    assert inside["first_contact_s"] is None
     assert failing(summarize(read_report(path))) == ["box"]
 
 
@@ -141,10 +161,12 @@ def only(frames: list[Finding], path: Path, required_m: float = 0.0) -> dict[str
         renderer="",
         parts=frozenset({"clearance", "doubt"}),
         cameras=("cam1", "cam2"),
+        meshes=(stored_mesh(FREE.body),),
     )
     with ReportWriter(path, header, overwrite=True) as writer:
         for row, finding in enumerate(frames):
-            writer.append(FrameResult(row, row / 10, "", (finding,), {}))
+            findings = (verdict_on(finding, required_m),)
+            writer.append(FrameResult(row, row / 10, "", findings, {}))
         writer.finish()
     return summarize(read_report(path))
 
@@ -155,7 +177,7 @@ def test_the_nearest_frame_and_the_least_at_95_percent_may_be_different_ones(
     numbers = only([near(20.0, 1.0), near(15.0, 12.0)], tmp_path / "r.h5")
 
     (found,) = numbers["objects"]
-    assert found["verdict"] == "free"
+    assert found["verdict"] == "kept"
     assert found["clearance"]["frame"] == 1
     assert found["clearance"]["lower_m"] == pytest.approx(0.015)
     assert found["clearance"]["at_least_95_m"] == pytest.approx(0.001)
@@ -174,13 +196,18 @@ def test_inside_alone_is_a_verdict_and_fails(tmp_path: Path) -> None:
     assert failing(numbers) == ["box"]
 
 
-@pytest.mark.parametrize(("lower_mm", "fails"), [(9.85, True), (9.95, False), (10.0, False)])
-def test_only_what_is_certainly_too_near_fails(
-    tmp_path: Path, lower_mm: float, fails: bool
+@pytest.mark.parametrize(
+    ("lower_mm", "verdict"), [(9.85, "too near"), (9.95, "open"), (10.0, "kept")]
+)
+def test_only_what_is_certainly_far_enough_passes_unless_more_is_let_pass(
+    tmp_path: Path, lower_mm: float, verdict: str
 ) -> None:
-    numbers = only([near(lower_mm)], tmp_path / "r.h5", required_m=0.01)
+    numbers = only([near(lower_mm), near(50.0)], tmp_path / "r.h5", required_m=0.01)
 
-    assert failing(numbers) == (["box"] if fails else [])
+    assert numbers["verdict"] == verdict
+    assert failing(numbers) == ([] if verdict == "kept" else ["box"])
+    assert failing(numbers, [verdict]) == []
+    assert failing(numbers, ["not seen"]) == ([] if verdict == "kept" else ["box"])
 
 
 def test_json_holds_no_number_that_json_does_not_know(
@@ -207,7 +234,10 @@ def test_the_text_says_what_must_be_known(
     assert "may hold nothing real" in told
     assert "4, 1 more perhaps" in told
     assert "30.00-30.10" in told
-    assert "12.30" in told
+    assert "12.30, no exit in 1 frame" in told
+    assert told.startswith("clash: 0 of 1 objects keep their distance (1 clash)")
+    assert "2 clash, 1 inside, 1 too near, 1 unknown, 1 open, 1 kept" in told
+    assert "moving it by D_rec frees all of it in 0 of 1 frame; 50.00 mm along V_rec do" in told
 
 
 def test_the_picture_shows_each_object_in_its_colours(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.contacts import FREE, contact_at, points_of
 from helpers.hulls import ball_hull, ball_masks, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
@@ -17,7 +18,6 @@ from hybridve.hull.contact.backtrack import (
 )
 from hybridve.hull.contact.detect import (
     Body,
-    Contact,
     certify_contacts,
     detect_contacts,
     make_body,
@@ -283,13 +283,13 @@ def test_a_contact_that_no_hull_confirms_keeps_its_own_point(
 ) -> None:
     before, after = ball(0.0, 0.2), ball(0.0, 0.1)
     body = make_body(plates(-0.2), viewport=50)
-    rim = Contact("", np.array([[0.25, 0.5, -0.2]], np.float32), np.zeros(1, np.uint32))
+    rim = contact_at([[0.25, 0.5, -0.2]])
 
     found = first_contact(before, after, body, rim, certifier if is_certified else None, engine)
 
     assert found.status == "no touch found"
     assert (found.fraction, found.fraction_uncertainty) == (1.0, 1.0)
-    np.testing.assert_array_equal(found.point_world, rim.points_world[0])
+    np.testing.assert_array_equal(found.point_world, points_of(rim)[0])
 
 
 def test_samples_touch_after_the_surface_does_and_soon(
@@ -358,7 +358,7 @@ def test_hulls_of_other_cameras_and_contacts_without_a_point_are_refused(
     hull = ball(0.0, 0.1)
     others = ball_hull(ring_views(4, 480, 324, 471.0), np.zeros(3), 0.05)
     body = make_body(plates(-0.2), viewport=10)
-    nothing = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+    nothing = FREE
     with pytest.raises(ValueError, match="not of the same views"):
         interpolated_hull(hull, others, 0.5)
     with pytest.raises(ValueError, match="not of the same views"):

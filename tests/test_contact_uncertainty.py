@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.boards import look_at, make_camera
 from helpers.cones import BOX_FACES, ball_extent, box_vertices, hull_of_balls, plate, views_from
+from helpers.contacts import FREE
 from helpers.hulls import ball_hull, ball_masks, ring_views
 from numpy.typing import NDArray
 from scipy.stats import binom
@@ -27,8 +28,6 @@ from hybridve.hull.contact.uncertainty import (
 )
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
-
-FREE = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
 
 CLOSELY = DoubtSettings(near_m=np.inf)
 

@@ -9,13 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.contacts import contact_at
 from helpers.sessions import BALL_RADIUS_M, write_ball_session, write_cube_scene
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.clearance import Clearance
-from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.scene import load_scene
@@ -23,7 +23,7 @@ from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import Chain, EvaluateSettings, evaluate, make_chain
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
-from hybridve.hull.report.schema import POINT_COLUMNS, TABLES, FrameResult
+from hybridve.hull.report.schema import PATCH_COLUMNS, TABLES, FrameResult
 
 FPS = 25
 
@@ -88,7 +88,13 @@ def bits(result: FrameResult) -> list[object]:
                 None if part is None else np.asarray(column.take(part)).tobytes()
                 for column in table.columns
             ]
-        kept += [column.take(finding.contact).tobytes() for column in POINT_COLUMNS]
+        hits = finding.contact.hits
+        kept += [hits.start.tobytes(), hits.stop.tobytes()]
+        kept += [
+            np.asarray(column.take(patch)).tobytes()
+            for patch in finding.patches
+            for column in PATCH_COLUMNS
+        ]
     return kept
 
 
@@ -254,7 +260,7 @@ def test_what_is_not_asked_for_is_not_computed(session: Path, scene: Path, engin
 
 NOWHERE = np.full(3, np.nan)
 SOMEWHERE = np.array([1.0, 2.0, 3.0])
-POINTS = (np.ones((1, 3), np.float32), np.zeros(1, np.uint32))
+POINTS = np.ones((1, 3))
 
 
 def a_clearance(lower_m: float, upper_m: float, depth_m: tuple[float, float]) -> Clearance:
@@ -262,7 +268,7 @@ def a_clearance(lower_m: float, upper_m: float, depth_m: tuple[float, float]) ->
 
 
 def test_a_witness_makes_the_clearance_nought() -> None:
-    contact = Contact("colliding", *POINTS, SOMEWHERE)
+    contact = contact_at(POINTS, "colliding", witness_world=SOMEWHERE)
 
     shallow = agreed(contact, a_clearance(0.0, 5e-5, (0.0, 2e-5)))[1]
     deep = agreed(contact, a_clearance(0.0, 0.0, (0.01, 0.02)))[1]
@@ -276,7 +282,7 @@ def test_a_witness_makes_the_clearance_nought() -> None:
 
 @pytest.mark.parametrize("certificate", ["", "open"])
 def test_a_clearance_above_nought_proves_an_object_free(certificate: Any) -> None:
-    contact = Contact(certificate, *POINTS, open_at_m=1e-4)
+    contact = contact_at(POINTS, certificate, open_at_m=1e-4)
 
     proved = agreed(contact, a_clearance(1e-6, 1e-4, (0.0, 0.0)))[0]
     still = agreed(contact, a_clearance(0.0, 1e-4, (0.0, 0.0)))[0]

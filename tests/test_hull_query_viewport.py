@@ -111,4 +111,4 @@ def test_hits_are_positioned_to_the_bits_of_the_specification(seed: int, largest
             found = place_runs(start, stop, before, vertices, faces, viewports)
 
             np.testing.assert_array_equal(found[0], triangle[chosen])
-            np.testing.assert_array_equal(found[1], expected.astype(np.float32))
+            np.testing.assert_array_equal(found[1], expected)

@@ -421,7 +421,7 @@ def numbers(result: FrameResult) -> list[Any]:
     said: list[Any] = [result.index, result.reason]
     for one in result.findings:
         assert one.clearance is not None
-        said += [one.contact.certificate, one.contact.points_world.tolist()]
+        said += [one.contact.certificate, one.contact.points()[0].tolist()]
         said += [one.clearance.lower_m, one.clearance.upper_m, str(one.approach_m_s)]
         said += [str(one.first_contact), str(one.response), str(one.doubt)]
     return said
@@ -467,7 +467,7 @@ def test_engines_that_keep_things_from_frame_to_frame_agree(chain: Chain, engine
         chain, settings=replace(chain.settings, clearance_m=None, response=None, open_at_m=None)
     )
     expected = [
-        [one.contact.triangle.tolist() for one in result.findings]
+        [one.contact.hits.start.tolist() for one in result.findings]
         for result in evaluate(plain, engine)
     ]
     assert any(triangles for frame in expected for triangles in frame)
@@ -475,7 +475,7 @@ def test_engines_that_keep_things_from_frame_to_frame_agree(chain: Chain, engine
     for kind in (Compute, Stencil):
         with kind(context) as other:
             found = [
-                [one.contact.triangle.tolist() for one in result.findings]
+                [one.contact.hits.start.tolist() for one in result.findings]
                 for result in evaluate(plain, other)
             ]
         assert found == expected

@@ -208,10 +208,10 @@ def test_collision_points_lie_in_the_hull(run: Run, horseman: Path, tmp_path: Pa
     assert run("detect", horseman, *arguments) == 0
 
     xyz_m, _ = read_points(path, "forearm", 0)
-    is_near = contains_points(hull_of(horseman, 100), xyz_m.astype(np.float64))
+    is_inside = contains_points(hull_of(horseman, 100), xyz_m)
     assert len(xyz_m) > 1000
-    # The file's single precision moves a point by 1e-7 m, which matters only at a pixel's edge.
-    assert is_near.mean() > 0.999
+    # The engine and the specification may differ by the rounding of a pixel's edge.
+    assert is_inside.mean() > 0.9999
 
 
 @pytest.mark.parametrize(("frame", "litres"), [(0, 49.46), (100, 51.89)])

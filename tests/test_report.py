@@ -8,18 +8,24 @@ from typing import Any, get_args
 import h5py
 import numpy as np
 import pytest
+from helpers.contacts import FREE, crumpled_body, free_contact, points_of, some_hits, stored_mesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from hybridve.calib.errors import ReportError
 from hybridve.hull.contact.backtrack import FirstContact
 from hybridve.hull.contact.clearance import Clearance
-from hybridve.hull.contact.detect import Contact
-from hybridve.hull.contact.finding import Finding
+from hybridve.hull.contact.detect import Body, Contact
+from hybridve.hull.contact.finding import Finding, judged
+from hybridve.hull.contact.patches import Patch
+from hybridve.hull.contact.recovery import Recovery
 from hybridve.hull.contact.respond import Response
 from hybridve.hull.contact.uncertainty import Doubt
+from hybridve.hull.contact.verdict import VERDICTS
 from hybridve.hull.report import write
+from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.read import read_points, read_report
 from hybridve.hull.report.schema import STAGES, FrameResult, Kind, ReportHeader
 from hybridve.hull.report.summarize import spans, summarize
@@ -32,7 +38,11 @@ _FEW = settings(
 
 
 CAMERAS = ("left", "right", "top")
-PARTS = ("clearance", "first contact", "response", "doubt")
+PARTS = ("clearance", "first contact", "response", "recovery", "doubt")
+
+#: What the reports are about: two objects, and a frame far from the world's origin.
+BODIES = [crumpled_body(seed, f"object_{seed}") for seed in range(2)]
+ORIGIN_M = (4_000_000.0, -200.0, 0.0)
 
 
 def a_header(n_objects: int, **changes: Any) -> ReportHeader:
@@ -44,27 +54,44 @@ def a_header(n_objects: int, **changes: Any) -> ReportHeader:
         "engine": "native",
         "renderer": "a processor",
         "cameras": CAMERAS,
+        "local_origin_m": ORIGIN_M,
+        "meshes": tuple(local_mesh(BODIES[i]) for i in range(n_objects)),
     }
     return ReportHeader(**(values | changes))
 
 
+def local_mesh(body: Body) -> StoredMesh:
+    """Return the mesh of an object that stands where the report's places begin."""
+    return stored_mesh(body)
+
+
 def a_result(index: int, *contacts: Contact, reason: str = "") -> FrameResult:
-    return FrameResult(index, index / 25, reason, tuple(map(Finding, contacts)), {})
+    state = "unread" if reason else "evaluated"
+    findings = tuple(
+        judged(Finding(one), is_closed=False, required_m=0.0, share_seen=1.0, rests_on="")
+        for one in contacts
+    )
+    return FrameResult(index, index / 25, reason, findings, {}, state)
 
 
-def a_contact(draw: st.DrawFn, rng: np.random.Generator) -> Contact:
-    n_points = draw(st.integers(0, 4))
+def a_contact(draw: st.DrawFn, rng: np.random.Generator, body: Body) -> Contact:
+    share = draw(st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]))
     certificate = draw(st.sampled_from(["colliding", "free", "open", ""]))
     return Contact(
         certificate,
-        rng.normal(size=(n_points, 3)).astype(np.float32),
-        np.sort(rng.integers(0, 3, n_points)).astype(np.uint32),
+        body,
+        some_hits(body, rng, share),
         rng.normal(size=3) if certificate == "colliding" else np.full(3, np.nan),
         rng.uniform() if certificate == "open" else np.nan,
     )
 
 
-def a_finding(draw: st.DrawFn, rng: np.random.Generator) -> Finding:
+def a_patch(rng: np.random.Generator) -> Patch:
+    vector, number = lambda: rng.normal(size=3), rng.normal
+    return Patch(vector(), vector(), (number(), number()), vector(), vector(), 3, 2**40)
+
+
+def a_finding(draw: st.DrawFn, rng: np.random.Generator, body: Body) -> Finding:
     """Return a finding in which every number differs from every other, and parts are missing."""
     number, vector = rng.normal, lambda: rng.normal(size=3)
     there = {part for part in PARTS if draw(st.booleans())}
@@ -86,7 +113,7 @@ def a_finding(draw: st.DrawFn, rng: np.random.Generator) -> Finding:
     survives = draw(st.sampled_from([not hinges_on, None]))
     doubt = Doubt(number(), number(), number(), vector(), False, 2, survives, hinges_on, "unsure")
     return Finding(
-        a_contact(draw, rng),
+        a_contact(draw, rng, body),
         clearance if "clearance" in there else None,
         (number(), number()),
         first if "first contact" in there else None,
@@ -94,6 +121,10 @@ def a_finding(draw: st.DrawFn, rng: np.random.Generator) -> Finding:
         number(),
         response if "response" in there else None,
         doubt if "doubt" in there else None,
+        Recovery("open", number(), number()) if "recovery" in there else None,
+        tuple(a_patch(rng) for _ in range(draw(st.integers(0, 2)))),
+        draw(st.sampled_from(VERDICTS)),
+        draw(st.sampled_from(["", "at most 3 mm away"])),
     )
 
 
@@ -103,9 +134,16 @@ def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
     results = []
     for index in range(draw(st.integers(1, 9))):
         reason = draw(st.sampled_from(["", "", "", "camera 'ü' has stopped recording"]))
-        findings = tuple(a_finding(draw, rng) for _ in range(0 if reason else n_objects))
+        findings = tuple(
+            a_finding(draw, rng, body) for body in BODIES[: 0 if reason else n_objects]
+        )
         stage_s = dict(zip(STAGES, rng.uniform(size=len(STAGES)).tolist(), strict=True))
-        results.append(FrameResult(index, index / 25, reason, findings, stage_s))
+        state = draw(st.sampled_from(["unread", "contradictory"])) if reason else "evaluated"
+        rests_on = draw(st.sampled_from(["", "left saw nothing"]))
+        share = () if state == "unread" else tuple(rng.uniform(size=len(CAMERAS)).tolist())
+        results.append(
+            FrameResult(index, index / 25, reason, findings, stage_s, state, rests_on, share)
+        )
     return results
 
 
@@ -140,6 +178,11 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
     report = read_report(path)
     assert report.index.tolist() == [result.index for result in results]
     assert report.reason.tolist() == [result.reason for result in results]
+    assert report.state.tolist() == [result.state for result in results]
+    assert report.rests_on.tolist() == [result.rests_on for result in results]
+    for number, camera in enumerate(CAMERAS):
+        expected = [one.object_share[number] if one.object_share else np.nan for one in results]
+        np.testing.assert_array_equal(report.cameras[camera]["object_share"], expected)
     assert list(report.objects) == ["object_0", "object_1"]
     for stage in STAGES:
         assert report.stage_s[stage].tolist() == [result.stage_s[stage] for result in results]
@@ -152,15 +195,34 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
                 assert np.isnan(rows.witness_m[row]).all()
                 assert np.isnan(rows.open_at_m[row])
                 assert len(xyz_m) == 0
+                assert (rows.verdict[row], rows.why[row]) == ("unknown", result.reason)
                 continue
             contact = result.findings[number].contact
             assert rows.collides[row] == contact.collides
-            assert rows.n_triangles[row] == len(set(contact.triangle.tolist()))
+            expected_m, expected_triangle = contact.points()
+            assert rows.n_triangles[row] == len(set(expected_triangle.tolist()))
+            assert rows.n_points[row] == len(expected_triangle)
+            finding = result.findings[number]
+            assert (rows.verdict[row], rows.why[row]) == (finding.verdict, finding.reason)
             assert rows.certificate[row] == contact.certificate
-            np.testing.assert_array_equal(rows.witness_m[row], contact.witness_world)
+            assert_place(rows.witness_m[row], contact.witness_world)
             np.testing.assert_array_equal(rows.open_at_m[row], contact.open_at_m)
-            np.testing.assert_array_equal(xyz_m, contact.points_world)
-            np.testing.assert_array_equal(triangle, contact.triangle)
+            np.testing.assert_array_equal(xyz_m - ORIGIN_M, expected_m + ORIGIN_M - ORIGIN_M)
+            np.testing.assert_array_equal(triangle, expected_triangle)
+            start, stop = rows.patches["offset"][row : row + 2]
+            for patch, at in zip(finding.patches, range(int(start), int(stop)), strict=True):
+                assert_place(rows.patches["cp_obj_m"][at], patch.cp_obj_world)
+                assert_place(rows.patches["on_hull_m"][at], patch.on_hull_world)
+                assert_place(rows.patches["lower_m"][at], patch.lower_world)
+                extent_m = patch.upper_world - patch.lower_world
+                np.testing.assert_array_equal(rows.patches["extent_m"][at], extent_m)
+                np.testing.assert_array_equal(rows.patches["clearance_m"][at], patch.clearance_m)
+                assert (rows.patches["triangles"][at], rows.patches["points"][at]) == (3, 2**40)
+
+
+def assert_place(found_m: NDArray[np.float64], expected_m: NDArray[np.float64]) -> None:
+    """Assert that a place is where it was, but for the rounding at 4,000 km."""
+    np.testing.assert_allclose(found_m, expected_m, atol=1e-9)
 
 
 def expected_columns(finding: Finding) -> dict[str, Any]:
@@ -195,6 +257,12 @@ def expected_columns(finding: Finding) -> dict[str, Any]:
             "d_rec_difference_m": response.d_rec_paper_m - response.d_rec_m,
             "response_status_paper": response.status_paper,
         }
+    if finding.recovery is not None:
+        recovery = finding.recovery
+        expected |= {
+            "recovery_frees": recovery.frees,
+            "free_shift_m": (recovery.blocked_m, recovery.free_m),
+        }
     if doubt is not None:
         expected |= {
             "clearance_std_m": doubt.std_m,
@@ -209,7 +277,18 @@ def expected_columns(finding: Finding) -> dict[str, Any]:
     return expected
 
 
+PLACES = {
+    "clearance_on_object_m",
+    "clearance_on_hull_m",
+    "first_contact_m",
+    "cp_obj_m",
+    "cp_hull_m",
+    "cp_hull_paper_m",
+}
+
 COLUMNS_OF_CONTACT = {
+    "verdict",
+    "reason",
     "collides",
     "n_points",
     "n_triangles",
@@ -233,7 +312,9 @@ def test_every_column_is_read_back_and_what_is_missing_is_nan_nought_or_empty(
             expected = {} if result.reason else expected_columns(result.findings[number])
             for name, values in rows.columns.items():
                 value = values[row]
-                if name in expected:
+                if name in PLACES and name in expected:
+                    assert_place(value, expected[name])
+                elif name in expected:
                     np.testing.assert_array_equal(value, np.asarray(expected[name]), name)
                 elif name not in COLUMNS_OF_CONTACT:
                     is_float = np.issubdtype(values.dtype, np.floating)
@@ -308,20 +389,23 @@ def test_vtk_reads_the_points_of_every_frame(
         reader.UpdateTimeStep(result.time_s)  # as ParaView asks
 
         shown = reader.GetOutputDataObject(0)
-        contacts = [finding.contact for finding in result.findings]
-        expected = [point for c in contacts for point in c.points_world.tolist()]
-        triangles = [number for c in contacts for number in c.triangle.tolist()]
-        objects = [i for i, c in enumerate(contacts) for _ in c.triangle]
-        assert [list(shown.GetPoint(i)) for i in range(shown.GetNumberOfPoints())] == expected
-        assert shown.GetNumberOfCells() == (1 if expected else 0)
-        for name, values in (("triangle", triangles), ("object", objects)):
-            array = shown.GetPointData().GetArray(name)
-            assert [array.GetValue(i) for i in range(array.GetNumberOfValues())] == values
+        assert shown.GetNumberOfPartitionedDataSets() == 2 * len(BODIES)
+        for number, body in enumerate(BODIES):
+            surface = shown.GetPartition(2 * number, 0)
+            vertices_m = body.triangles.vertices_world
+            assert surface.GetNumberOfPoints() == len(vertices_m)
+            assert surface.GetNumberOfCells() == len(body.triangles)
+            cloud = shown.GetPartition(2 * number + 1, 0)
+            expected_m = np.zeros((0, 3))
+            if result.findings:
+                expected_m = points_of(result.findings[number].contact)
+            found_m = [cloud.GetPoint(i) for i in range(cloud.GetNumberOfPoints())]
+            assert found_m == [tuple(one) for one in expected_m.astype(np.float32).tolist()]
+            assert cloud.GetNumberOfCells() == (1 if len(expected_m) else 0)
 
 
 def one_result() -> list[FrameResult]:
-    contact = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
-    return [a_result(0, contact, contact)]
+    return [a_result(0, FREE, FREE)]
 
 
 def test_a_killed_run_leaves_finished_parts_that_can_be_taken_up(
@@ -401,7 +485,7 @@ def test_every_dataset_says_its_unit_and_meaning_and_is_checked(report: Path) ->
     with h5py.File(report) as file:
         file["hybridve"].visititems(check)
         assert dict(file.attrs)["format"] == "hybridve-report"
-        assert file.attrs["version"] == 1
+        assert file.attrs["version"] == 2
 
 
 def test_a_report_from_before_a_column_was_known_is_read(report: Path) -> None:
@@ -477,13 +561,10 @@ def test_spans_cover_the_true_flags_and_nothing_else(flags: list[bool]) -> None:
     assert covered == flags
 
 
-NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
-
-
 def test_a_witness_counts_as_a_collision_and_open_is_not_free(tmp_path: Path) -> None:
-    free = Contact("free", *NOTHING)
-    missed = Contact("colliding", *NOTHING, np.array([1.0, 2.0, 3.0]))
-    is_open = [Contact("open", *NOTHING, open_at_m=size_m) for size_m in (1e-4, 3e-4)]
+    free = FREE
+    missed = free_contact("colliding", witness_world=np.array([1.0, 2.0, 3.0]))
+    is_open = [free_contact("open", open_at_m=size_m) for size_m in (1e-4, 3e-4)]
     path = tmp_path / "report.h5"
 
     write_all(
@@ -496,7 +577,7 @@ def test_a_witness_counts_as_a_collision_and_open_is_not_free(tmp_path: Path) ->
     )
 
     first, second = summarize(read_report(path))["objects"]
-    assert first["verdict"] == "colliding"
+    assert first["verdict"] == "clash"
     assert (first["frames_colliding"], first["frames_sampled_colliding"]) == (1, 0)
     assert [span["first_frame"] for span in first["spans"]] == [1]
     assert second["verdict"] == "open"
@@ -504,20 +585,25 @@ def test_a_witness_counts_as_a_collision_and_open_is_not_free(tmp_path: Path) ->
     assert second["open_at_m"] == 3e-4
 
 
-def test_an_object_is_called_free_only_if_every_evaluated_frame_is_proved(tmp_path: Path) -> None:
-    free, sampled = Contact("free", *NOTHING), Contact("", *NOTHING)
+def test_a_distance_is_kept_only_if_every_frame_is_evaluated_and_proved(tmp_path: Path) -> None:
+    free, sampled = FREE, free_contact("")
     path = tmp_path / "report.h5"
 
     write_all(
         path,
         [
             a_result(0, free, free),
-            a_result(1, reason="camera gone"),
             a_result(2, free, sampled),
         ],
     )
 
     numbers = summarize(read_report(path))
-    assert [found["verdict"] for found in numbers["objects"]] == ["free", "clear"]
+    # The worst comes first.
+    assert [found["name"] for found in numbers["objects"]] == ["object_1", "object_0"]
+    assert [found["verdict"] for found in numbers["objects"]] == ["open", "kept"]
+    write_all(path, [a_result(0, free, free), a_result(1, reason="camera gone")], overwrite=True)
+    numbers = summarize(read_report(path))
+    assert [found["verdict"] for found in numbers["objects"]] == ["unknown", "unknown"]
+    assert numbers["verdict"] == "unknown"
     assert numbers["frames_invalid"] == 1
     assert numbers["reasons"] == {"camera gone": 1}

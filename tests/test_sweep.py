@@ -40,8 +40,6 @@ from hybridve.hull.sweep.truth import (
     dense_mesh,
     dense_viewports,
     sample_body,
-    thinned_samples,
-    touched_triangles,
 )
 
 #: Reported points are stored in single precision.
@@ -479,8 +477,8 @@ def test_samples_are_counted_and_thinned_without_writing_them_out(
     sample = number - topology.samples_before[triangle]
     hits = Hits.from_samples(topology, triangle.astype(np.uint32), sample.astype(np.uint32))
 
-    touched, first = touched_triangles(hits)
-    thin_triangle, thin_sample = thinned_samples(hits, most)
+    touched, first = hits.touched()
+    thin_triangle, thin_sample = hits.thinned(most)
 
     expected, at = np.unique(triangle, return_index=True)
     np.testing.assert_array_equal(touched, expected)

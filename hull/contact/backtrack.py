@@ -299,7 +299,7 @@ def _point_of(contact: Contact) -> NDArray[np.float64]:
     """Return a point of a contact: its witness, or the first of its points."""
     if np.isfinite(contact.witness_world).all():
         return contact.witness_world
-    return np.asarray(contact.points_world[0], np.float64)
+    return np.asarray(contact.some_points(1)[0][0])
 
 
 # --- outlines between two frames ------------------------------------------------------------------

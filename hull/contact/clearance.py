@@ -102,6 +102,68 @@ class Clearance:
         return self.lower_m - depth_upper_m, self.upper_m - depth_lower_m
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Level:
+    """Cells of one size, and the cubes that tell their distances.
+
+    Attributes
+    ----------
+    center : (N, 3) float64
+        Metres, in the object's frame.
+    half_m : float
+        Half of an edge.
+    cube : (N,) int64
+        The cube that holds each.
+    cubes : Cubes
+        With known corners.
+    """
+
+    center: NDArray[np.float64]
+    half_m: float
+    cube: NDArray[np.int64]
+    cubes: Cubes
+
+    def only(self, kept: NDArray[np.bool_]) -> "_Level":
+        """Return some of the cells."""
+        return _Level(self.center[kept], self.half_m, self.cube[kept], self.cubes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NearCells:
+    """Cubes in which a point of one frame's hull may be nearer to an object than was asked.
+
+    All points of the hull that are so near lie in them.
+    """
+
+    _meter: "ClearanceMeter"
+    _asked: CellFrame
+    _level: _Level
+
+    @property
+    def center_world(self) -> NDArray[np.float64]:
+        """The centres (N, 3), metres."""
+        return np.asarray(self._level.center + self._meter._origin_world)
+
+    @property
+    def half_m(self) -> float:
+        """Half of an edge."""
+        return self._level.half_m
+
+    def places(self, points_world: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return which place of their lattice points (M, 3) lie in: three whole numbers each."""
+        local = points_world - self._meter._origin_world
+        return np.asarray(np.floor(local / (2.0 * self.half_m)), np.int64)
+
+    def measure(self, kept: NDArray[np.bool_]) -> Clearance:
+        """Return how far the hull within some of the cubes is from the object.
+
+        Its lower bound holds for what of the hull lies in these cubes.
+        """
+        best = Best(np.full(1, np.inf), np.full(3, np.nan))
+        lowest_m = self._meter._refine(self._level.only(kept), best, self._asked)
+        return self._meter._found(best, lowest_m, self._level.half_m, np.zeros(3))
+
+
 class ClearanceMeter:
     """Measures how far hulls are from one object, and remembers distances between frames.
 
@@ -194,12 +256,19 @@ class ClearanceMeter:
             lowest_m = self._search(root_m, best, asked, stop_above_m, stop_below_m)
             if best.distance_m[0] <= beyond_m or min(lowest_m, beyond_m) > stop_above_m:
                 break
+        return self._found(best, min(lowest_m, beyond_m), root_m, shift_world)
+
+    def _found(
+        self, best: Best, lowest_m: float, root_m: float, shift_world: NDArray[np.float64]
+    ) -> Clearance:
+        """Return what a search found: the best point, and a bound of all others."""
+        origin_world = self._origin_world + shift_world
         upper_m: float = np.inf
         on_object = best.point
         if best.distance_m[0] < np.inf:  # the exact distance of the best point
             signed_m, nearest = self._surface.signed(best.point[None])
             upper_m, on_object = float(signed_m[0]), nearest[0]
-        least_m = min(lowest_m, upper_m, beyond_m) - _ROUNDOFF * root_m
+        least_m = min(lowest_m, upper_m) - _ROUNDOFF * root_m
         return Clearance(
             lower_m=max(least_m, 0.0),
             upper_m=max(upper_m, 0.0),
@@ -222,41 +291,90 @@ class ClearanceMeter:
         Returns a lower bound of the signed distance of any point of the hull in it, unless that is
         the distance of `best` itself; inf if it holds none.
         """
-        half_m, fine_m = root_m, _FINE * self.tolerance_m
-        center, cube = np.zeros((1, 3)), np.zeros(1, np.int64)
-        cubes = self._lattice.cubes(center, half_m, fine_m)
+        return self._refine(self._root(root_m), best, asked, stop_above_m, stop_below_m)
+
+    def near_cells(self, hull: Hull, within_m: float, cell_m: float, most: int) -> "NearCells":
+        """Return the cubes in which a point of the hull may be nearer to the object than asked.
+
+        Parameters
+        ----------
+        hull : Hull
+            The hull of one frame.
+        within_m : float
+            How near, not negative; points on a closed object's inside are near.
+        cell_m : float
+            The largest edge of a cube.
+        most : int
+            Larger cubes are returned where there were more than so many.
+        """
+        asked = make_cell_frame(hull, self._origin_world, self._roots_m[-1])
+        root_m = next(
+            (root for root in self._roots_m if root - self._size_m > within_m), self._roots_m[-1]
+        )
+        level, best = self._root(root_m), Best(np.full(1, np.inf), np.full(3, np.nan))
+        while 2.0 * level.half_m > cell_m:
+            level, lower_m, _ = self._split(level, asked, best)
+            level = level.only(lower_m <= within_m)
+            if len(level.center) > most:
+                break
+        return NearCells(self, asked, level)
+
+    def _root(self, root_m: float) -> "_Level":
+        center = np.zeros((1, 3))
+        cubes = self._lattice.cubes(center, root_m, _FINE * self.tolerance_m)
+        return _Level(center, root_m, np.zeros(1, np.int64), cubes)
+
+    def _split(
+        self, level: "_Level", asked: CellFrame, best: Best
+    ) -> tuple["_Level", NDArray[np.float64], int]:
+        """Return the parts of cells that are not free, their bounds, and the deepest of them."""
+        half_m, cubes = level.half_m / 2.0, level.cubes
+        whole, center, inside = split_cells(level.center, half_m, asked)
+        cube = level.cube[whole]
+        if half_m >= self._roots_m[-1] / 2.0**FINEST_LEVEL:
+            own = ~cubes.is_fine[cube]
+            cube[own] = len(cubes.half_m) + np.arange(int(own.sum()))
+            more = self._lattice.cubes(center[own], half_m, _FINE * self.tolerance_m)
+            cubes = _joined(cubes, more)
+        lower_m, deepest = bound_cells(
+            center,
+            inside,
+            half_m,
+            cube,
+            cubes,
+            self._lattice.distance_m,
+            self._lattice.nearest,
+            asked,
+            best,
+        )
+        return _Level(center, half_m, cube, cubes), lower_m, deepest
+
+    def _refine(
+        self,
+        level: "_Level",
+        best: Best,
+        asked: CellFrame,
+        stop_above_m: float = np.inf,
+        stop_below_m: float = -np.inf,
+    ) -> float:
+        """Look for the hull's nearest point in cells, better than `best`; as `_search`."""
         dropped_m, lowest_m = np.inf, -np.inf
-        finest_m = self._roots_m[-1] / 2.0**FINEST_LEVEL
         for _ in range(_MOST_LEVELS):
-            half_m /= 2.0
-            whole, center, inside = split_cells(center, half_m, asked)
-            cube = cube[whole]
-            if half_m >= finest_m:
-                own = ~cubes.is_fine[cube]
-                cube[own] = len(cubes.half_m) + np.arange(int(own.sum()))
-                cubes = _joined(cubes, self._lattice.cubes(center[own], half_m, fine_m))
-            lower_m, deepest = bound_cells(
-                center,
-                inside,
-                half_m,
-                cube,
-                cubes,
-                self._lattice.distance_m,
-                self._lattice.nearest,
-                asked,
-                best,
-            )
+            level, lower_m, deepest = self._split(level, asked, best)
+            center, half_m = level.center, level.half_m
             if deepest >= 0:
                 n_looks = _LOOKS if len(center) > _FEW_CELLS else 0
                 self._look_deeper(best, center[deepest], half_m, asked, n_looks)
             kept = lower_m < best.distance_m[0] - self.tolerance_m
             dropped_m = min(dropped_m, lower_m[~kept].min(initial=np.inf))
             lowest_m = lower_m[kept].min(initial=np.inf)
-            center, cube = center[kept], cube[kept]
+            level = level.only(kept)
+            center = level.center
             if (
                 len(center) == 0
                 or np.sqrt(3.0) * half_m < _SMALLEST_CELL * self.tolerance_m
-                or len(center) > (_MOST_CELLS if best.distance_m[0] >= 0 else _MOST_DEEP_CELLS)
+                or len(level.center)
+                > (_MOST_CELLS if best.distance_m[0] >= 0 else _MOST_DEEP_CELLS)
                 or min(lowest_m, dropped_m, best.distance_m[0]) > stop_above_m
                 or best.distance_m[0] < stop_below_m
             ):

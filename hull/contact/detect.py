@@ -60,11 +60,11 @@ class Contact:
     ----------
     certificate : Certificate
         How far the verdict can be trusted. It may say "colliding" where no sample does.
-    points_world : (P, 3) float32
-        The collision points CP_i in metres, those of a triangle together; none if no sample of the
-        object is in the hull.
-    triangle : (P,) uint32
-        The triangle of the scene that each collision point lies on.
+    body : Body
+        The object.
+    hits : Hits
+        Which of its samples are in the hull: the collision points CP_i, as runs. A swallowed
+        object is one run, and nobody waits for points that he does not want; `points` makes them.
     witness_world : (3,) float64
         Metres: a point of the surface that is in the hull; NaN unless it is certified to collide.
     open_at_m : float
@@ -72,20 +72,55 @@ class Contact:
     """
 
     certificate: Certificate
-    points_world: NDArray[np.float32]
-    triangle: NDArray[np.uint32]
+    body: Body
+    hits: Hits
     witness_world: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.nan))
     open_at_m: float = np.nan
 
     @property
     def collides(self) -> bool:
         """Whether a sample of the object's surface is in the hull."""
-        return len(self.triangle) > 0
+        return len(self.hits.start) > 0
+
+    @property
+    def n_points(self) -> int:
+        """How many samples are in the hull."""
+        return len(self.hits)
 
     @property
     def n_triangles(self) -> int:
         """How many triangles have a collision point."""
-        return int(np.count_nonzero(np.diff(self.triangle))) + 1 if self.collides else 0
+        return len(self.hits.touched()[0]) if self.collides else 0
+
+    def triangles(self) -> NDArray[np.uint32]:
+        """Return the numbers in the scene of the triangles with a collision point, ascending."""
+        return np.sort(self.body.numbers[self.hits.touched()[0]])
+
+    def points(self) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+        """Return all collision points, (P, 3) metres in the world, and each one's triangle (P,).
+
+        Those of a triangle stand together; triangles are numbered as in the scene.
+        """
+        return collision_points(self.body, self.hits)
+
+    def some_points(self, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+        """Return every k-th collision point, at most so many; as `points`."""
+        return self._placed(*self.hits.thinned(most))
+
+    def end_points(self) -> NDArray[np.float64]:
+        """Return collision points among which is the farthest from any point, (E, 3) metres."""
+        return self._placed(*self.hits.ends())[0]
+
+    def _placed(
+        self, triangle: NDArray[np.int64], sample: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+        mesh = self.body.triangles
+        points_world = sample_positions(
+            mesh.vertices_world[mesh.faces[triangle]],
+            mesh.viewports[triangle],
+            sample.astype(np.uint32),
+        )
+        return points_world, self.body.numbers[triangle]
 
 
 def make_body(
@@ -133,7 +168,7 @@ def detect_contacts(hull: Hull, bodies: list[Body], engine: Engine) -> list[Cont
     near = [body for body, is_free in zip(bodies, free, strict=True) if not is_free]
     hits = iter(engine.query(hull, [body.triangles for body in near]))
     return [
-        _no_contact("free") if is_free else _contact(hull, body, next(hits))
+        no_contact(body) if is_free else _contact(hull, body, next(hits))
         for body, is_free in zip(bodies, free, strict=True)
     ]
 
@@ -152,21 +187,21 @@ def _certified(hull: Hull, body: Body, contact: Contact, certifier: Certifier) -
     found = certifier.certify_mesh(hull, body.triangles)
     if found.verdict == FREE:
         # Points, if there are any, were rounded across the rim of a silhouette in single precision.
-        return _no_contact("free")
+        return no_contact(body)
     if found.verdict == COLLIDING:
         return replace(contact, certificate="colliding", witness_world=found.witness_world)
     return replace(contact, certificate="open", open_at_m=found.open_at_m)
 
 
-def _no_contact(certificate: Certificate) -> Contact:
-    return Contact(certificate, np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+def no_contact(body: Body, certificate: Certificate = "free") -> Contact:
+    """Return that no sample of an object is in the hull."""
+    return Contact(certificate, body, Hits.none(body.triangles.topology))
 
 
 def _contact(hull: Hull, body: Body, hits: Hits) -> Contact:
-    if len(hits) == 0:
-        return _no_contact("")
-    points_world, numbers = collision_points(body, hits)
-    contact = Contact("", points_world, numbers)
+    contact = Contact("", body, hits)
+    if not contact.collides:
+        return contact
     # An engine in single precision may err at the rim of a silhouette; a witness may not.
     mesh = body.triangles
     triangle, sample = hits.samples(_MAX_WITNESSES)
@@ -180,7 +215,7 @@ def _contact(hull: Hull, body: Body, hits: Hits) -> Contact:
     return replace(contact, certificate="colliding", witness_world=witness_world)
 
 
-def collision_points(body: Body, hits: Hits) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def collision_points(body: Body, hits: Hits) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
     """Return where the samples of hits lie, (P, 3) metres, and each one's triangle of the scene."""
     mesh = body.triangles
     triangle, points_world = place_runs(

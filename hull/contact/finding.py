@@ -7,10 +7,13 @@ import numpy as np
 
 from hybridve.hull.contact.backtrack import FirstContact
 from hybridve.hull.contact.clearance import Clearance
-from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.detect import Contact, no_contact
 from hybridve.hull.contact.respond import Response
+from hybridve.hull.contact.verdict import Facts, Verdict, judge
 
 if TYPE_CHECKING:
+    from hybridve.hull.contact.patches import Patch
+    from hybridve.hull.contact.recovery import Recovery
     from hybridve.hull.contact.uncertainty import Doubt
 
 
@@ -35,6 +38,14 @@ class Finding:
         Which way an object that is touched must give.
     doubt : Doubt or None
         How far contact and clearance can be trusted.
+    recovery : Recovery or None
+        Whether the response frees the whole object.
+    patches : tuple of Patch
+        The connected pieces of the hull that touch it, or come nearer than it requires.
+    verdict : Verdict
+        Whether it keeps its distance.
+    reason : str
+        Why, or what that rests on; empty where it goes without saying.
     """
 
     contact: Contact
@@ -45,6 +56,10 @@ class Finding:
     first_contact_uncertainty_s: float = np.nan
     response: Response | None = None
     doubt: "Doubt | None" = None
+    recovery: "Recovery | None" = None
+    patches: "tuple[Patch, ...]" = ()
+    verdict: Verdict = "unknown"
+    reason: str = ""
 
     @property
     def touches(self) -> bool:
@@ -64,6 +79,27 @@ class Finding:
         return self.touches or self.is_inside
 
 
+def judged(
+    finding: Finding, *, is_closed: bool, required_m: float, share_seen: float, rests_on: str
+) -> Finding:
+    """Return a finding with its verdict; see `hybridve.hull.contact.verdict.Facts`."""
+    clearance = finding.clearance
+    verdict, reason = judge(
+        Facts(
+            finding.touches,
+            finding.is_inside,
+            is_closed,
+            finding.contact.certificate,
+            finding.contact.open_at_m,
+            (np.nan, np.nan) if clearance is None else (clearance.lower_m, clearance.upper_m),
+            required_m,
+            share_seen,
+            rests_on,
+        )
+    )
+    return replace(finding, verdict=verdict, reason=reason)
+
+
 def agreed(contact: Contact, clearance: Clearance) -> tuple[Contact, Clearance]:
     """Return a contact and a clearance of one object, each with what the other one proves.
 
@@ -81,8 +117,7 @@ def agreed(contact: Contact, clearance: Clearance) -> tuple[Contact, Clearance]:
             on_hull_world=clearance.on_hull_world if is_deep else contact.witness_world,
         )
     if clearance.lower_m > 0.0 and contact.certificate != "free":
-        nothing = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
-        return nothing, clearance
+        return no_contact(contact.body), clearance
     return contact, clearance
 
 

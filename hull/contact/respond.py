@@ -55,9 +55,10 @@ Status = Literal["", "no direction", "no exit", "outside", "no normal"]
 #: were not all found, or span no plane.
 PaperStatus = Literal["", "no direction", "base inside", "outside", "missed", "no normal"]
 
-#: Collision points are stored in single precision. One no farther from RP_obj than this, as a share
-#: of its largest coordinate, has no direction to it but that of its rounding.
-_SAME_POINT = 2.0**-22
+#: One CP_obj no farther from RP_obj than this has no direction to it but that of rounding: as a
+#: share of its largest coordinate, in double precision; as a share of the object's size, since CAD
+#: files hold vertices in single precision.
+_SAME_POINT, _SAME_IN_CAD = 2.0**-46, 2.0**-22
 
 #: Two vectors whose angle has no larger sine span no plane.
 _NO_PLANE = 1e-6
@@ -173,7 +174,11 @@ def respond(
         settings = ResponseSettings()
     if cp_obj_world is None:
         cp_obj_world = collision_point(contact, reference_point_world)
-    v_rec = _recovery_vector(cp_obj_world, reference_point_world, recovery_direction)
+    same_m = max(
+        _SAME_POINT * float(np.abs(cp_obj_world).max()),
+        _SAME_IN_CAD * float((contact.body.upper_world - contact.body.lower_world).max()),
+    )
+    v_rec = _recovery_vector(cp_obj_world, reference_point_world, recovery_direction, same_m)
     nowhere = np.full(3, np.nan)
     if v_rec is None:
         unknown = (nowhere, nowhere, np.nan)
@@ -203,13 +208,20 @@ def collision_point(
         if np.isnan(contact.witness_world).any():
             raise ValueError("the contact has neither a collision point nor a witness")
         return contact.witness_world
+    return farthest_from(reference_point_world, contact.end_points())
+
+
+def farthest_from(
+    reference_point_world: NDArray[np.float64], points_world: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the one of points (P, 3) that is farthest from a reference point (3,), world frame.
+
+    Of several, the first in the order of x, then y, then z.
+    """
     # Summed by hand: a reduction may add in another order for another number of points.
-    x, y, z = (
-        contact.points_world[:, axis].astype(np.float64) - reference_point_world[axis]
-        for axis in range(3)
-    )
+    x, y, z = (points_world[:, axis] - reference_point_world[axis] for axis in range(3))
     squared = x * x + y * y + z * z
-    farthest = contact.points_world[squared == squared.max()].astype(np.float64)
+    farthest = points_world[squared == squared.max()]
     first: NDArray[np.float64] = farthest[np.lexsort(farthest.T[::-1])[0]]
     return first
 
@@ -218,8 +230,9 @@ def _recovery_vector(
     cp_obj_world: NDArray[np.float64],
     reference_point_world: NDArray[np.float64],
     recovery_direction: NDArray[np.float64] | None,
+    same_m: float,
 ) -> NDArray[np.float64] | None:
-    """Return V_rec as a unit vector, None if CP_obj lies at RP_obj."""
+    """Return V_rec as a unit vector, None if CP_obj lies within `same_m` of RP_obj."""
     if recovery_direction is not None:
         length = float(np.linalg.norm(recovery_direction))
         if not 0 < length < np.inf:
@@ -227,7 +240,7 @@ def _recovery_vector(
         return np.asarray(recovery_direction / length)
     towards = reference_point_world - cp_obj_world
     distance_m = float(np.linalg.norm(towards))
-    if distance_m <= _SAME_POINT * float(np.abs(cp_obj_world).max()):
+    if distance_m <= same_m:
         return None
     return np.asarray(towards / distance_m)
 

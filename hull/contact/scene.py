@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from hybridve.calib.errors import SceneError
-from hybridve.calib.pose import rotation_about_axes
+from hybridve.calib.pose import placed, rotation_about_axes
 from hybridve.hull.contact.mesh import TESSELLATION_M, CadFile, kind_of, read_cad
 from hybridve.hull.contact.part import Part, Up
 from hybridve.hull.contact.readers import FORMATS, TESSELLATED, WITH_UNIT
@@ -117,6 +117,10 @@ class SceneObject:
         What the file says of its colour, 0 to 1, as a picture shows it (sRGB), and its opacity.
     about : dict
         What the report says of where it came from, as plain JSON values; see `load_scene`.
+    vertices_mesh : (V, 3) float64 or None
+        Metres, in the frame of the mesh, turned z up; None if that is the world's.
+    world_from_mesh : (3, 4) float64
+        Where that frame lies: `vertices_world` is `placed` by it.
     """
 
     name: str
@@ -129,6 +133,8 @@ class SceneObject:
     is_closed: bool = False
     color: tuple[float, float, float, float] | None = None
     about: dict[str, Any] = field(default_factory=dict)
+    vertices_mesh: NDArray[np.float64] | None = None
+    world_from_mesh: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))
 
     @property
     def box_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -212,13 +218,13 @@ def load_scene(path: Path) -> Scene:
             raise SceneError(str(error)) from None
         except SceneError as error:
             raise SceneError(f"{label}.mesh: {error}") from error
-        for placed in _place(entry, cad):
-            if placed.name in objects:
+        for part in _place(entry, cad):
+            if part.name in objects:
                 raise SceneError(
-                    f"{label}.name: this object or a part of it would be called {placed.name!r}, "
+                    f"{label}.name: this object or a part of it would be called {part.name!r}, "
                     "as another is already; give it another name"
                 )
-            objects[placed.name] = placed
+            objects[part.name] = part
         for file in (cad.path, *cad.beside):
             checksum.update(file.read_bytes())
     return Scene(
@@ -275,8 +281,9 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
         if up != "z":
             columns, signs = _FROM_UP[up]
             vertices = vertices[:, columns] * signs
-        # Not with @, whose threads cost more than they save here, and may round by their number.
-        vertices_world = np.einsum("ij,kj->ik", vertices * unit_m, rotation) + translation_m
+        vertices_mesh = vertices * unit_m
+        world_from_mesh = np.column_stack([rotation, translation_m])
+        vertices_world = placed(vertices_mesh, world_from_mesh)
         if entry.reference_point_mm is not None:
             reference_point_world = (
                 rotation @ (np.array(entry.reference_point_mm) / 1000.0) + translation_m
@@ -305,6 +312,8 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             is_closed=topology.closed,
             color=part.rgba,
             about=about | _about_mesh(part, topology, unit_m),
+            vertices_mesh=vertices_mesh,
+            world_from_mesh=world_from_mesh,
         )
 
 

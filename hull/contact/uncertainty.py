@@ -511,14 +511,10 @@ class FrameDoubts:
 
 def _touching_points(contact: Contact) -> NDArray[np.float64]:
     """Return points of a contact (P, 3), the witness first; evenly chosen where there are many."""
-    points_world = contact.points_world
-    if len(points_world) > _MOST_POINTS:
-        chosen = np.linspace(0, len(points_world) - 1, _MOST_POINTS).round().astype(np.int64)
-        points_world = points_world[chosen]
     witness_world = contact.witness_world[None]
     if not np.isfinite(witness_world).all():
         witness_world = np.zeros((0, 3))
-    return np.concatenate([witness_world, points_world.astype(np.float64)])
+    return np.concatenate([witness_world, contact.some_points(_MOST_POINTS)[0]])
 
 
 def _count_seeing(views: Views, point_world: NDArray[np.float64]) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.viewport import MAX_VIEWPORT, expand_runs, samples_before
+from hybridve.hull.query.viewport import MAX_VIEWPORT, expand_runs, run_ends, samples_before
 
 EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
@@ -189,6 +189,11 @@ class Hits:
         stop = number[np.append(is_first[1:], True)[: len(number)]] + 1
         return cls(topology, start, stop)
 
+    @classmethod
+    def none(cls, topology: Topology) -> Self:
+        """Return no hits."""
+        return cls(topology, np.zeros(0, np.int64), np.zeros(0, np.int64))
+
     def __len__(self) -> int:
         return int((self.stop - self.start).sum())
 
@@ -201,6 +206,48 @@ class Hits:
         triangle, sample = np.zeros(count, np.uint32), np.zeros(count, np.uint32)
         expand_runs(self.start, self.stop, self.topology.samples_before, triangle, sample)
         return triangle, sample
+
+    def touched(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the triangles with a sample inside, ascending, and the first such sample of each.
+
+        Without writing out the samples, which may be millions.
+        """
+        before = self.topology.samples_before
+        first = np.searchsorted(before, self.start, side="right") - 1
+        last = np.searchsorted(before, self.stop - 1, side="right") - 1
+        steps = np.zeros(len(before), np.int64)
+        np.add.at(steps, first, 1)
+        np.add.at(steps, last + 1, -1)
+        triangle = np.flatnonzero(np.cumsum(steps[:-1]) > 0)
+        sample = np.zeros(len(triangle), np.int64)
+        # A run begins in its first triangle and goes on from sample 0 of those that follow. Where a
+        # run from before reaches into the triangle, sample 0 is the first.
+        begins, run = np.unique(first, return_index=True)
+        at = np.searchsorted(triangle, begins)
+        sample[at] = self.start[run] - before[begins]
+        reached = np.unique(last[last > first])
+        sample[np.searchsorted(triangle, reached)] = 0
+        return triangle, sample
+
+    def thinned(self, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return triangle and sample of every k-th of the samples inside, at most so many."""
+        lengths = self.stop - self.start
+        ends = np.cumsum(lengths)
+        total = int(ends[-1]) if len(ends) else 0
+        pick = np.arange(0, total, max(1, -(-total // most)))
+        run = np.searchsorted(ends, pick, side="right")
+        return self.at(self.start[run] + pick - (ends[run] - lengths[run]))
+
+    def at(self, number: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return triangle and number in its viewport of samples (N,) numbered through the mesh."""
+        before = self.topology.samples_before
+        triangle = np.searchsorted(before, number, side="right") - 1
+        return triangle, number - before[triangle]
+
+    def ends(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return triangle and sample of those among which is the farthest from any point."""
+        topology = self.topology
+        return self.at(run_ends(self.start, self.stop, topology.samples_before, topology.viewports))
 
 
 class Closing:

@@ -168,10 +168,10 @@ def place_runs(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int32],
     viewports: NDArray[np.int32],
-) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
     """Return triangles (P,) and positions (P, 3) of the samples of runs.
 
-    The positions are those of `sample_positions`, rounded once.
+    The positions are those of `sample_positions`.
 
     Parameters
     ----------
@@ -187,9 +187,69 @@ def place_runs(
         The viewport of each triangle.
     """
     count = int((stop - start).sum())
-    triangle, positions = np.zeros(count, np.uint32), np.zeros((count, 3), np.float32)
+    triangle, positions = np.zeros(count, np.uint32), np.zeros((count, 3))
     _place_runs(start, stop, before, vertices, faces, viewports, triangle, positions)
     return triangle, positions
+
+
+@compiled
+def run_ends(
+    start: NDArray[np.int64],
+    stop: NDArray[np.int64],
+    before: NDArray[np.int64],
+    viewports: NDArray[np.int32],
+) -> NDArray[np.int64]:
+    """Return the samples at the ends of what runs hold, among which is the farthest from any point.
+
+    Of a triangle that a run holds wholly these are its three vertices, else the ends of each row
+    of its viewport: samples between two others are on a straight line, and the distance to a point
+    is convex along it.
+
+    Parameters
+    ----------
+    start, stop : (R,) int64
+        Runs of samples, numbered through the mesh, ascending.
+    before : (T + 1,) int64
+        Samples of the triangles before each; see `samples_before`.
+    viewports : (T,) int32
+        The viewport of each triangle.
+
+    Returns
+    -------
+    (E,) int64
+        Numbers through the mesh, ascending but for repetitions.
+    """
+    ends = np.zeros(64, np.int64)
+    n, t = ZERO, ZERO
+    for run in range(len(start)):
+        number = start[run]
+        if number >= before[t + 1]:
+            t = _triangle_of(number, before, t + 1)
+        while number < stop[run]:
+            end = min(stop[run], before[t + 1])
+            u = np.int64(viewports[t])
+            if n + 2 * u + 3 > len(ends):
+                more = np.zeros(2 * len(ends) + 2 * u + 3, np.int64)
+                more[:n] = ends[:n]
+                ends = more
+            if number == before[t] and end == before[t + 1]:
+                ends[n], ends[n + 1], ends[n + 2] = number, number + u - 1, end - 1
+                n += 3
+            else:
+                j, row = ZERO, before[t]
+                while number >= row + u - j:  # the row that the run begins in
+                    row += u - j
+                    j += 1
+                while number < end:
+                    ends[n], ends[n + 1] = number, min(end, row + u - j) - 1
+                    n += 2
+                    number = ends[n - 1] + 1
+                    row += u - j
+                    j += 1
+            number = end
+            if number == before[t + 1]:
+                t += 1
+    return ends[:n]
 
 
 @compiled
@@ -214,7 +274,7 @@ def _place_runs(
     faces: NDArray[np.int32],
     viewports: NDArray[np.int32],
     triangle: NDArray[np.uint32],
-    positions: NDArray[np.float32],
+    positions: NDArray[np.float64],
 ) -> None:
     n, t = ZERO, ZERO
     shares = np.zeros(1)  # i / (u - 1) for all i, of the last viewport

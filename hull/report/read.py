@@ -11,12 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.hull.contact.verdict import Facts, judge
+from hybridve.hull.report.collisions import Runs, StoredMesh
 from hybridve.hull.report.result_file import reading
 from hybridve.hull.report.schema import (
+    CAMERA_COLUMNS,
     FRAME_COLUMNS,
-    OFFSET,
+    MESH_COLUMNS,
+    PATCH_COLUMNS,
+    PATCH_OFFSET,
+    READ_VERSIONS,
+    RUN_COLUMNS,
+    RUN_OFFSET,
     TABLES,
-    VERSION,
     Column,
 )
 
@@ -29,15 +36,16 @@ class ObjectColumns:
     ----------
     columns : dict of arrays
         By the names of `hybridve.hull.report.schema`, (F, ...) each; a column that is not there
-        was not computed.
-    offset : (F + 1,) uint64
-        The collision points of row f are ``offset[f]`` to ``offset[f + 1]``; see `read_points`.
+        was not computed. Places are in the world.
+    patches : dict of arrays
+        By their names without ``patches/``: one row a patch, places in the world; ``offset``: those
+        of row f are ``offset[f]`` to ``offset[f + 1]``. Empty where the report has none.
     about : dict
         Attributes: the mesh, its number of triangles, the spacing of its samples.
     """
 
     columns: dict[str, NDArray[Any]]
-    offset: NDArray[np.uint64]
+    patches: dict[str, NDArray[Any]]
     about: dict[str, Any]
 
     def __contains__(self, name: str) -> bool:
@@ -58,7 +66,17 @@ class ObjectColumns:
         return self.columns["collides"]
 
     @property
-    def n_points(self) -> NDArray[np.uint32]:
+    def verdict(self) -> NDArray[np.str_]:
+        """Whether it keeps its distance, (F,); see `hybridve.hull.contact.verdict`."""
+        return self.columns["verdict"]
+
+    @property
+    def why(self) -> NDArray[np.str_]:
+        """Why the verdicts are what they are, where that does not go without saying, (F,)."""
+        return self.columns["reason"]
+
+    @property
+    def n_points(self) -> NDArray[np.uint64]:
         """The number of collision points, (F,)."""
         return self.columns["n_points"]
 
@@ -120,10 +138,16 @@ class Report:
         When they were recorded.
     reason : (F,) str
         Why a frame could not be evaluated; empty if it was.
+    state : (F,) str
+        "evaluated", "unread" or "contradictory".
+    rests_on : (F,) str
+        What it rests on that a frame has no hull; empty if it has.
     stage_s : dict of (F,) float64
         Seconds of work by stage.
     objects : dict of ObjectColumns
         By name.
+    cameras : dict of dicts of (F,) arrays
+        By name; empty for a report of version 1.
     """
 
     path: Path
@@ -133,8 +157,11 @@ class Report:
     index: NDArray[np.uint32]
     time_s: NDArray[np.float64]
     reason: NDArray[np.str_]
+    state: NDArray[np.str_]
+    rests_on: NDArray[np.str_]
     stage_s: dict[str, NDArray[np.float64]]
     objects: dict[str, ObjectColumns]
+    cameras: dict[str, dict[str, NDArray[Any]]]
 
 
 def read_report(path: Path) -> Report:
@@ -145,8 +172,11 @@ def read_report(path: Path) -> Report:
     ReportError
         If there is no such file, it is not a report, of an unknown version, or damaged.
     """
-    with reading(path, "report", VERSION) as file:
-        frames = _columns(file["hybridve/frames"], FRAME_COLUMNS, may_be_absent=True)
+    with reading(path, "report", *READ_VERSIONS) as file:
+        frames = _columns(file["hybridve/frames"], FRAME_COLUMNS, 0.0, may_be_absent=True)
+        origin_m = _origin(file)
+        reason = frames["reason"]
+        nothing = np.full(len(reason), "", np.str_)
         return Report(
             path=path,
             attributes={name: _plain(value) for name, value in file.attrs.items()},
@@ -154,52 +184,115 @@ def read_report(path: Path) -> Report:
             rig=json.loads(file["hybridve/settings/rig"].asstr()[()]),
             index=frames["index"],
             time_s=frames["time_s"],
-            reason=frames["reason"],
+            reason=reason,
+            state=frames.get("state", np.where(reason == "", "evaluated", "unread")),
+            rests_on=frames.get("rests_on", nothing),
             stage_s={
                 name.removeprefix(_STAGE): seconds
                 for name, seconds in frames.items()
                 if name.startswith(_STAGE)
             },
             objects={
-                name: ObjectColumns(
-                    columns={
-                        key: values
-                        for table in TABLES
-                        for key, values in _columns(
-                            group, table.columns, may_be_absent=table.part != "contact"
-                        ).items()
-                    },
-                    offset=group[OFFSET.name][:],
-                    about={key: _plain(value) for key, value in group.attrs.items()},
-                )
+                name: _object(group, origin_m, reason)
                 for name, group in file["hybridve/objects"].items()
             },
+            cameras={
+                name: _columns(group, CAMERA_COLUMNS, 0.0, may_be_absent=True)
+                for name, group in file.get("hybridve/cameras", {}).items()
+            },
         )
+
+
+def _origin(file: h5py.File) -> NDArray[np.float64]:
+    """Return where the places of a file begin; those of version 1 are in the world."""
+    if "hybridve/settings/local_origin_m" not in file:
+        return np.zeros(3)
+    return np.asarray(file["hybridve/settings/local_origin_m"][:], np.float64)
+
+
+def _object(
+    group: h5py.Group, origin_m: NDArray[np.float64], reason: NDArray[np.str_]
+) -> ObjectColumns:
+    columns = {
+        key: values
+        for table in TABLES
+        for key, values in _columns(group, table.columns, origin_m, may_be_absent=True).items()
+    }
+    patches: dict[str, NDArray[Any]] = {}
+    if PATCH_OFFSET.name in group:
+        patches = {
+            key.removeprefix("patches/"): values
+            for key, values in _columns(
+                group, (PATCH_OFFSET, *PATCH_COLUMNS), origin_m, may_be_absent=False
+            ).items()
+        }
+    about = {key: _plain(value) for key, value in group.attrs.items()}
+    found = ObjectColumns(columns, patches, about)
+    for name in ("collides", "n_points", "n_triangles", "certificate", "witness_m", "open_at_m"):
+        found[name]  # a report without these is damaged
+    if "verdict" not in columns:
+        verdict, why = _judged(found, reason)
+        columns |= {"verdict": verdict, "reason": why}
+    return found
+
+
+def _judged(
+    rows: ObjectColumns, reason: NDArray[np.str_]
+) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
+    """Return the verdicts and reasons (F,) of a report of version 1, which has none."""
+    unknown = np.full((len(reason), 2), np.nan)
+    clearance_m = rows.columns.get("clearance_m", unknown)
+    found = [
+        ("unknown", str(why))
+        if why
+        else judge(
+            Facts(
+                bool(rows.touches[row]),
+                bool(rows.is_inside[row]),
+                bool(rows.about.get("closed", False)),
+                str(rows.certificate[row]),
+                float(rows.open_at_m[row]),
+                (float(clearance_m[row, 0]), float(clearance_m[row, 1])),
+                float(rows.about.get("required_clearance_m", 0.0)),
+            )
+        )
+        for row, why in enumerate(reason)
+    ]
+    verdicts, reasons = zip(*found, strict=True) if found else ((), ())
+    return np.array(verdicts, np.str_), np.array(reasons, np.str_)
 
 
 _STAGE = "stage_s/"
 
 
 def _columns(
-    group: h5py.Group, columns: Iterable[Column[Any]], *, may_be_absent: bool
+    group: h5py.Group,
+    columns: Iterable[Column[Any]],
+    origin_m: NDArray[np.float64] | float,
+    *,
+    may_be_absent: bool,
 ) -> dict[str, NDArray[Any]]:
-    """Return columns by name; raise KeyError if one is absent that may not be."""
-    return {
-        column.name: group[column.name].asstr()[:].astype(np.str_)
-        if column.dtype is str
-        else group[column.name][:]
-        for column in columns
-        if not may_be_absent or column.name in group
-    }
+    """Return columns by name, places in the world; raise KeyError if one is absent that may not."""
+    found = {}
+    for column in columns:
+        if may_be_absent and column.name not in group:
+            continue
+        if column.dtype is str:
+            found[column.name] = group[column.name].asstr()[:].astype(np.str_)
+        elif column.is_place:
+            found[column.name] = group[column.name][:] + origin_m
+        else:
+            found[column.name] = group[column.name][:]
+    return found
 
 
-def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
     """Return one object's collision points of one row.
 
     Returns
     -------
-    xyz_m : (P, 3) float32
-        World frame, metres.
+    xyz_m : (P, 3) float64
+        World frame, metres; of a report of version 1 rounded to single precision.
     triangle : (P,) uint32
         The triangle that each lies on.
 
@@ -208,13 +301,26 @@ def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float32], N
     ReportError
         As `read_report`, or if there is no such object.
     """
-    with reading(path, "report", VERSION) as file:
+    with reading(path, "report", *READ_VERSIONS) as file:
         if f"hybridve/objects/{name}" not in file:
             known = ", ".join(file["hybridve/objects"])
             raise ReportError(f"{path}: there is no object {name!r}; it has {known}")
-        points = file[f"hybridve/objects/{name}/points"]
-        start, stop = (int(value) for value in points["offset"][row : row + 2])
-        return points["xyz_m"][start:stop], points["triangle"][start:stop]
+        group = file[f"hybridve/objects/{name}"]
+        if RUN_OFFSET.name not in group:
+            start, stop = (int(value) for value in group["points/offset"][row : row + 2])
+            return (
+                group["points/xyz_m"][start:stop].astype(np.float64),
+                group["points/triangle"][start:stop],
+            )
+        start, stop = (int(value) for value in group[RUN_OFFSET.name][row : row + 2])
+        runs = Runs(*(group[column.name][start:stop] for column in RUN_COLUMNS))
+        xyz_m, triangle = read_mesh(group).points(runs, row)
+        return xyz_m + _origin(file), triangle
+
+
+def read_mesh(group: h5py.Group) -> StoredMesh:
+    """Return the mesh that stands in an object's group."""
+    return StoredMesh(*(group[column.name][:] for column in MESH_COLUMNS))
 
 
 def _plain(value: Any) -> Any:

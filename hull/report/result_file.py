@@ -30,8 +30,8 @@ def writing(path: Path) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def reading(path: Path, what: str, version: int) -> Iterator[h5py.File]:
-    """Yield a file of the format ``hybridve-WHAT`` to read from.
+def reading(path: Path, what: str, *versions: int) -> Iterator[h5py.File]:
+    """Yield a file of the format ``hybridve-WHAT`` and one of these versions to read from.
 
     Raises
     ------
@@ -46,9 +46,10 @@ def reading(path: Path, what: str, version: int) -> Iterator[h5py.File]:
             if found != f"hybridve-{what}":
                 raise ReportError(f"{path}: holds {found}, expected hybridve-{what}")
             stored = int(file.attrs["version"])
-            if stored != version:
+            if stored not in versions:
+                known = " and ".join(map(str, versions))
                 raise ReportError(
-                    f"{path}: {what} version {stored}, this hybridve reads {version}; "
+                    f"{path}: {what} version {stored}, this hybridve reads {known}; "
                     "use the version that wrote it"
                 )
             yield file

@@ -1,6 +1,6 @@
 """What a report holds: every column declared once, and how it is taken from a result.
 
-The layout is that of DESIGN, 4.4. A dataset that is not there was not computed; none holds invented
+A dataset that is not there was not computed; none holds invented
 values. Writing, taking up a run that was cut off, and reading all go by the tables of this module:
 a new number in a report is one more line in one of them.
 """
@@ -12,19 +12,36 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.report.collisions import Runs, StoredMesh
+
 if TYPE_CHECKING:  # whoever only reads a report waits for none of these
     from hybridve.hull.contact.backtrack import FirstContact
     from hybridve.hull.contact.clearance import Clearance
     from hybridve.hull.contact.detect import Contact
     from hybridve.hull.contact.finding import Finding
+    from hybridve.hull.contact.patches import Patch
+    from hybridve.hull.contact.recovery import Recovery
     from hybridve.hull.contact.respond import Response
     from hybridve.hull.contact.uncertainty import Doubt
 
 FORMAT = "hybridve-report"
-VERSION = 1
+VERSION = 2
+
+#: Versions that are read.
+READ_VERSIONS = (1, 2)
 
 #: The stages whose seconds a report keeps, in the order in which a frame runs through them.
-STAGES = ("decode", "segment", "query", "certify", "clearance", "respond", "doubt", "write")
+STAGES = (
+    "decode",
+    "segment",
+    "query",
+    "certify",
+    "clearance",
+    "respond",
+    "patches",
+    "doubt",
+    "write",
+)
 
 #: How far a number can be trusted. "exact": what it says, to floating-point accuracy. "bound": the
 #: truth is on one side of it, or between two. "estimate": near the truth, by a model of errors or
@@ -32,7 +49,11 @@ STAGES = ("decode", "segment", "query", "certify", "clearance", "respond", "doub
 Kind = Literal["exact", "bound", "estimate", "sampled"]
 
 #: What an evaluation may compute of an object.
-Part = Literal["contact", "clearance", "first contact", "response", "doubt"]
+Part = Literal["contact", "clearance", "first contact", "response", "recovery", "doubt"]
+
+#: What became of a frame. "unread": its pictures, or the pose of a camera, are missing or damaged.
+#: "contradictory": its silhouettes cannot all be right.
+State = Literal["evaluated", "unread", "contradictory"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +68,12 @@ class FrameResult:
         When it was recorded, seconds from the session's first frame.
     reason : str
         Why the frame could not be evaluated; empty if it was.
+    state : State
+        What became of it.
+    rests_on : str
+        What the hull's emptiness rests on, in words; empty if it is not empty.
+    object_share : tuple of C floats
+        The share of each camera's picture that is object; empty if the frame was not read.
     findings : tuple of Finding
         One for each object of the report, in its order; empty if there is a reason.
     stage_s : dict
@@ -59,6 +86,13 @@ class FrameResult:
     reason: str
     findings: "tuple[Finding, ...]"
     stage_s: dict[str, float]
+    state: State = "evaluated"
+    rests_on: str = ""
+    object_share: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.state == "evaluated") == bool(self.reason):
+            raise ValueError(f"the frame is {self.state}, and its reason {self.reason!r}")
 
     @property
     def is_valid(self) -> bool:
@@ -91,6 +125,12 @@ class ReportHeader:
         Versions of the software that took part.
     machine : str
         The machine in words.
+    local_origin_m : tuple of 3 floats
+        Places in the file are metres about this point of the world.
+    meshes : tuple of StoredMesh
+        Per object.
+    points : "sample" or "all"
+        Whether all collision points are spelt out, or only a sample of them for pictures.
     """
 
     command: str
@@ -103,6 +143,9 @@ class ReportHeader:
     cameras: tuple[str, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
     machine: str = ""
+    local_origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    meshes: tuple[StoredMesh, ...] = ()
+    points: Literal["sample", "all"] = "sample"
 
 
 T = TypeVar("T")
@@ -128,6 +171,11 @@ class Column(Generic[T]):
         Returns its value of one row; (n, *shape) for a column of points.
     shape : tuple
         Of one value; "C" stands for the number of cameras.
+    is_place : bool
+        Whether it is a place: `take` gives it in the world, the file holds it about its local
+        origin.
+    absent : callable, optional
+        Its value in a frame that was not evaluated, of that frame; else `fill`.
     """
 
     name: str
@@ -137,6 +185,8 @@ class Column(Generic[T]):
     dtype: type
     take: Callable[[T], Any]
     shape: tuple[int | Literal["C"], ...] = ()
+    is_place: bool = False
+    absent: Callable[[FrameResult], Any] | None = None
 
     def shape_of(self, n_cameras: int) -> tuple[int, ...]:
         """Return the shape of one value."""
@@ -212,7 +262,60 @@ FRAME_COLUMNS: tuple[Column[FrameResult], ...] = (
         str,
         lambda result: result.reason,
     ),
+    Column(
+        "state",
+        "1",
+        "exact",
+        "evaluated; unread: pictures or the pose of a camera are missing or damaged; "
+        "contradictory: the silhouettes cannot all be right, and nothing is said of the objects",
+        str,
+        lambda result: result.state,
+    ),
+    Column(
+        "rests_on",
+        "1",
+        "exact",
+        "what it rests on that the frame has no hull: which cameras saw nothing; empty if it has",
+        str,
+        lambda result: result.rests_on,
+    ),
     *(_stage(name) for name in STAGES),
+)
+
+_VERDICT: "tuple[Column[Finding], ...]" = (
+    Column(
+        "verdict",
+        "1",
+        "exact",
+        "clash: a point of the surface is in the hull; inside: the hull is in the closed object; "
+        "too near: certainly nearer than required; unknown: the frame was not evaluated; open: "
+        "nothing found, nothing proved; not seen: where no point can be in the hull, whatever is "
+        "there; kept: proved to keep its distance",
+        str,
+        lambda finding: finding.verdict,
+        absent=lambda result: "unknown",
+    ),
+    Column(
+        "reason",
+        "1",
+        "exact",
+        "why the verdict is what it is, or what it rests on, where that does not go without saying",
+        str,
+        lambda finding: finding.reason,
+        absent=lambda result: result.reason,
+    ),
+)
+
+#: One row a frame, of each camera.
+CAMERA_COLUMNS: tuple[Column[float], ...] = (
+    Column(
+        "object_share",
+        "1",
+        "exact",
+        "share of the undistorted picture that is object; NaN if the frame was not read",
+        np.float64,
+        lambda share: share,
+    ),
 )
 
 _CONTACT: "tuple[Column[Contact], ...]" = (
@@ -229,8 +332,8 @@ _CONTACT: "tuple[Column[Contact], ...]" = (
         "1",
         "sampled",
         "number of collision points",
-        np.uint32,
-        lambda contact: len(contact.triangle),
+        np.uint64,
+        lambda contact: contact.n_points,
     ),
     Column(
         "n_triangles",
@@ -254,10 +357,11 @@ _CONTACT: "tuple[Column[Contact], ...]" = (
         "witness_m",
         "m",
         "exact",
-        "a point of the surface in every silhouette, world frame; NaN unless colliding",
+        "a point of the surface in every silhouette; NaN unless colliding",
         np.float64,
         lambda contact: contact.witness_world,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "open_at_m",
@@ -284,20 +388,22 @@ _CLEARANCE: "tuple[Column[Clearance], ...]" = (
         "clearance_on_object_m",
         "m",
         "bound",
-        "point of the object's surface that the upper bound was measured from, world frame",
+        "point of the object's surface that the upper bound was measured from",
         np.float64,
         lambda clearance: clearance.on_object_world,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "clearance_on_hull_m",
         "m",
         "bound",
-        "point of the hull that the upper bound was measured to, world frame; of a hull that is in "
+        "point of the hull that the upper bound was measured to; of a hull that is in "
         "a closed object its deepest point",
         np.float64,
         lambda clearance: clearance.on_hull_world,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "depth_m",
@@ -352,10 +458,11 @@ _FIRST_CONTACT: "tuple[Column[FirstContact], ...]" = (
         "first_contact_m",
         "m",
         "estimate",
-        "where the hull first touched the object's surface, world frame",
+        "where the hull first touched the object's surface",
         np.float64,
         lambda first: first.point_world,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "first_contact_status",
@@ -372,17 +479,18 @@ _RESPONSE: "tuple[Column[Response], ...]" = (
         "cp_obj_m",
         "m",
         "sampled",
-        "CP_obj, world frame: the collision point farthest from RP_obj, or that of first contact "
+        "CP_obj: the collision point farthest from RP_obj, or that of first contact "
         "where it was asked for; NaN where nothing collides",
         np.float64,
         lambda response: response.cp_obj_world,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "v_rec",
         "1",
         "exact",
-        "V_rec, unit vector, world frame: the way the object is moved out of the hull",
+        "V_rec, unit vector: the way the object is moved out of the hull",
         np.float64,
         lambda response: response.v_rec,
         shape=(3,),
@@ -391,10 +499,11 @@ _RESPONSE: "tuple[Column[Response], ...]" = (
         "cp_hull_m",
         "m",
         "exact",
-        "CP_hull, world frame: where the ray from CP_obj along V_rec leaves the hull",
+        "CP_hull: where the ray from CP_obj along V_rec leaves the hull",
         np.float64,
         lambda response: response.cp_hull_world,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "d_rec_m",
@@ -408,7 +517,7 @@ _RESPONSE: "tuple[Column[Response], ...]" = (
         "n_hull",
         "1",
         "estimate",
-        "N_hull, unit vector out of the hull, world frame: of the smoothed outline at CP_hull",
+        "N_hull, unit vector out of the hull: of the smoothed outline at CP_hull",
         np.float64,
         lambda response: response.n_hull,
         shape=(3,),
@@ -429,6 +538,7 @@ _RESPONSE: "tuple[Column[Response], ...]" = (
         np.float64,
         lambda response: response.cp_hull_paper_world,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "d_rec_paper_m",
@@ -462,6 +572,29 @@ _RESPONSE: "tuple[Column[Response], ...]" = (
         "what is wrong with the columns as published; empty if nothing is",
         str,
         lambda response: response.status_paper,
+    ),
+)
+
+_RECOVERY: "tuple[Column[Recovery], ...]" = (
+    Column(
+        "recovery_frees",
+        "1",
+        "exact",
+        "whether the whole object, moved along v_rec by d_rec_m and the tolerance of the "
+        "clearance, is free of the hull: yes or no, both proved; open: neither; empty where there "
+        "is no D_rec",
+        str,
+        lambda recovery: recovery.frees,
+    ),
+    Column(
+        "free_shift_m",
+        "m",
+        "bound",
+        "shift along v_rec that is not certain to free the whole object, and a larger one that is "
+        "proved to; inf where none was found, NaN where nothing was asked",
+        np.float64,
+        lambda recovery: (recovery.blocked_m, recovery.free_m),
+        shape=(2,),
     ),
 )
 
@@ -540,25 +673,128 @@ _DOUBT: "tuple[Column[Doubt], ...]" = (
 
 #: Of each object, one row a frame.
 TABLES: tuple[Table[Any], ...] = (
+    Table("contact", lambda finding: finding, _VERDICT),
     Table("contact", lambda finding: finding.contact, _CONTACT),
     Table("clearance", lambda finding: finding.clearance, _CLEARANCE),
     Table("clearance", lambda finding: finding, _APPROACH),
     Table("first contact", lambda finding: finding, _INSTANT),
     Table("first contact", lambda finding: finding.first_contact, _FIRST_CONTACT),
     Table("response", lambda finding: finding.response, _RESPONSE),
+    Table("recovery", lambda finding: finding.recovery, _RECOVERY),
     Table("doubt", lambda finding: finding.doubt, _DOUBT),
 )
 
-#: Of each object, one row a collision point.
-POINT_COLUMNS: "tuple[Column[Contact], ...]" = (
+#: Of each object, one row a run of collision points.
+RUN_COLUMNS: tuple[Column[Runs], ...] = (
+    Column(
+        "runs/triangle",
+        "1",
+        "sampled",
+        "triangle that a run of consecutive samples in the hull begins in; it goes on through the "
+        "triangles that follow in mesh/order",
+        np.uint32,
+        lambda runs: runs.triangle,
+    ),
+    Column(
+        "runs/first",
+        "1",
+        "sampled",
+        "number of its first sample in the viewport of that triangle",
+        np.uint32,
+        lambda runs: runs.first,
+    ),
+    Column(
+        "runs/count",
+        "1",
+        "sampled",
+        "how many samples the run has",
+        np.uint32,
+        lambda runs: runs.count,
+    ),
+)
+
+#: Of each object, one row a patch: a connected piece of the hull that is in contact with it, or
+#: nearer than it requires.
+PATCH_COLUMNS: "tuple[Column[Patch], ...]" = (
+    Column(
+        "patches/cp_obj_m",
+        "m",
+        "sampled",
+        "the patch's collision point farthest from RP_obj; without one, the point of the object "
+        "that the upper bound of its clearance was measured from",
+        np.float64,
+        lambda patch: patch.cp_obj_world,
+        shape=(3,),
+        is_place=True,
+    ),
+    Column(
+        "patches/on_hull_m",
+        "m",
+        "bound",
+        "point of the patch that the upper bound of its clearance was measured to",
+        np.float64,
+        lambda patch: patch.on_hull_world,
+        shape=(3,),
+        is_place=True,
+    ),
+    Column(
+        "patches/clearance_m",
+        "m",
+        "bound",
+        "lower and upper bound of the distance from the patch to the object; 0, 0 where it "
+        "touches; inf above where no point of the hull was found in it",
+        np.float64,
+        lambda patch: patch.clearance_m,
+        shape=(2,),
+    ),
+    Column(
+        "patches/lower_m",
+        "m",
+        "bound",
+        "lower corner of the box around the patch",
+        np.float64,
+        lambda patch: patch.lower_world,
+        shape=(3,),
+        is_place=True,
+    ),
+    Column(
+        "patches/extent_m",
+        "m",
+        "bound",
+        "edges of the box around the patch",
+        np.float64,
+        lambda patch: patch.upper_world - patch.lower_world,
+        shape=(3,),
+    ),
+    Column(
+        "patches/triangles",
+        "1",
+        "sampled",
+        "number of triangles with a collision point of the patch",
+        np.uint32,
+        lambda patch: patch.n_triangles,
+    ),
+    Column(
+        "patches/points",
+        "1",
+        "sampled",
+        "number of its collision points",
+        np.uint64,
+        lambda patch: patch.n_points,
+    ),
+)
+
+#: Of each object, one row a collision point, where all are spelt out.
+POINT_COLUMNS: tuple[Column[Any], ...] = (
     Column(
         "points/xyz_m",
         "m",
         "sampled",
-        "collision points CP_i, world frame",
+        "collision points CP_i, rounded to single precision",
         np.float32,
-        lambda contact: contact.points_world,
+        lambda points: points,
         shape=(3,),
+        is_place=True,
     ),
     Column(
         "points/triangle",
@@ -566,18 +802,74 @@ POINT_COLUMNS: "tuple[Column[Contact], ...]" = (
         "sampled",
         "number of the triangle that the collision point lies on",
         np.uint32,
-        lambda contact: contact.triangle,
+        lambda points: points,
     ),
 )
 
-#: Of each object, which points belong to which frame; made from the number of points.
-OFFSET: Column[NDArray[np.uint64]] = Column(
-    "points/offset",
-    "1",
-    "exact",
-    "the collision points of row f are points offset[f] to offset[f + 1]",
-    np.uint64,
-    lambda offset: offset,
+
+def offset_column(group: str, what: str) -> Column[NDArray[np.uint64]]:
+    """Return the column that says which rows of a group belong to which frame."""
+    return Column(
+        f"{group}/offset",
+        "1",
+        "exact",
+        f"the {what} of row f are {group} offset[f] to offset[f + 1]",
+        np.uint64,
+        lambda offset: offset,
+    )
+
+
+#: Which runs, patches and points belong to which frame; made from their numbers.
+RUN_OFFSET = offset_column("runs", "runs")
+PATCH_OFFSET = offset_column("patches", "patches")
+POINT_OFFSET = offset_column("points", "collision points")
+
+#: Of each object, its mesh as it was asked about.
+MESH_COLUMNS: tuple[Column[StoredMesh], ...] = (
+    Column(
+        "mesh/vertices_m",
+        "m",
+        "exact",
+        "vertices in the frame of the mesh",
+        np.float64,
+        lambda mesh: mesh.vertices_m,
+        shape=(3,),
+    ),
+    Column(
+        "mesh/faces",
+        "1",
+        "exact",
+        "vertex numbers of each triangle",
+        np.int32,
+        lambda mesh: mesh.faces,
+        shape=(3,),
+    ),
+    Column(
+        "mesh/viewport",
+        "1",
+        "exact",
+        "samples along an edge of each triangle",
+        np.uint16,
+        lambda mesh: mesh.viewport,
+    ),
+    Column(
+        "mesh/order",
+        "1",
+        "exact",
+        "triangles in the order in which runs go on through them",
+        np.uint32,
+        lambda mesh: mesh.order,
+    ),
+    Column(
+        "mesh/placement",
+        "1",
+        "exact",
+        "[R | t] with x = R vertex + t, metres about the local origin: as it stood; of an object "
+        "that moves, a row a frame",
+        np.float64,
+        lambda mesh: mesh.placement,
+        shape=(3, 4),
+    ),
 )
 
 

@@ -1,12 +1,15 @@
 """The numbers that a report comes down to."""
 
+import re
 from collections import Counter
+from collections.abc import Collection
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.contact.verdict import VERDICTS, worst
 from hybridve.hull.report.read import ObjectColumns, Report
 
 
@@ -16,33 +19,52 @@ def summarize(report: Report) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``report``, ``frames``, ``frames_invalid``, ``reasons`` (text to count),
+        ``verdict`` (the worst of all objects and frames), ``objects_by_verdict`` (how many have
+        which), ``report``, ``frames``, ``frames_invalid``, ``frames_contradictory`` (of these),
+        ``reasons`` (text to count),
         ``frames_without_hull`` (see `count_without_hull`), ``seconds`` (from first to last frame),
         ``engine``, ``renderer``, ``stage_ms_mean``, ``viewports`` (smallest and largest),
-        ``samples``, ``sample_spacing_m`` (largest) and ``objects``: for each ``name``, ``verdict``
-        ("colliding"; "inside": never touched, but something was wholly inside the closed object;
-        "free": proved in every evaluated frame; "open": so but for contacts thinner than
-        ``open_at_m``; "clear": no sample collided, nothing more was
-        asked), frames by what is known of them (``frames_colliding``: sampled or certified; frames
-        without a sample but with a witness are those that sampling alone would have missed;
-        ``frames_inside`` besides), the most points and triangles in one frame and ``spans`` of
-        clashing frames, each with its first contact and the speed of approach.
+        ``samples``, ``sample_spacing_m`` (largest) and ``objects``, worst first: for each ``name``,
+        ``verdict`` (its worst; see `hybridve.hull.contact.verdict`), ``frames_by_verdict``,
+        ``why`` (reasons of these frames to their number), frames by what is known of them
+        (``frames_colliding``: sampled or certified; frames without a sample but with a witness are
+        those that sampling alone would have missed; ``frames_inside`` besides), the most points,
+        triangles and patches in one frame and ``spans`` of clashing frames, each with its first
+        contact and the speed of approach. Frames that were not evaluated do not end a span.
 
         ``closed`` (whether the mesh closes off a volume: whether something is inside can be told).
         Where they were computed, ``clearance``: the smallest one, its bounds, where, when, and what
         it is at least at 95 %; ``depth``: the deepest, bounds and when; ``recovery``: the longest
-        D_rec, as published too; ``frames_below_required``: clashing frames and those in which the
-        hull is certainly nearer than ``required_clearance_m``, and
+        D_rec, as published too, in how many frames V_rec does not leave the hull, in how many
+        moving by D_rec was asked to free the whole object and does, and the shift along V_rec that
+        does in every frame (None if one has none); ``frames_below_required``: clashing frames and
+        those in which the hull is certainly nearer than ``required_clearance_m``, and
         ``frames_perhaps_below_required``: others in which it may be; ``frames_hinging``: clashing
         frames whose verdict one camera could turn, and ``hinges_on``, those cameras;
         ``frames_unsure``: clashing frames of a volume that may hold nothing real.
     """
     is_valid = report.reason == ""
     every = list(report.objects.values())
+    objects = [
+        {
+            "name": name,
+            **_about_verdict(rows),
+            **_about_touching(rows, report, is_valid),
+            **_about_clearance(rows, report, is_valid),
+            **_about_recovery(rows, report),
+            **_about_doubt(rows),
+        }
+        for name, rows in report.objects.items()
+    ]
+    objects.sort(key=_badness)
+    verdicts = Counter(str(found["verdict"]) for found in objects)
     return {
+        "verdict": worst(set(verdicts)),
+        "objects_by_verdict": {one: verdicts[one] for one in VERDICTS if verdicts[one]},
         "report": str(report.path),
         "frames": len(report.index),
         "frames_invalid": int((~is_valid).sum()),
+        "frames_contradictory": int((report.state == "contradictory").sum()),
         "reasons": dict(Counter(report.reason[~is_valid].tolist())),
         "frames_without_hull": count_without_hull(report),
         "seconds": float(report.time_s[-1] - report.time_s[0]) if len(report.time_s) else 0.0,
@@ -60,17 +82,16 @@ def summarize(report: Report) -> dict[str, Any]:
             (rows.about["sample_spacing_m"] for rows in every if "sample_spacing_m" in rows.about),
             default=None,
         ),
-        "objects": [
-            {
-                "name": name,
-                **_about_touching(rows, report, is_valid),
-                **_about_clearance(rows, report, is_valid),
-                **_about_recovery(rows, report),
-                **_about_doubt(rows),
-            }
-            for name, rows in report.objects.items()
-        ],
+        "objects": objects,
     }
+
+
+def _badness(found: dict[str, Any]) -> tuple[int, float, int]:
+    """Return what objects are sorted by: the worst first, of equals the nearest, the longest."""
+    lower_m = (found["clearance"] or {}).get("lower_m")
+    spare_m = np.inf if lower_m is None else lower_m - found["required_clearance_m"]
+    frames = found["frames_by_verdict"].get(found["verdict"], 0)
+    return VERDICTS.index(found["verdict"]), spare_m, -frames
 
 
 def count_without_hull(report: Report) -> int | None:
@@ -84,13 +105,36 @@ def count_without_hull(report: Report) -> int | None:
     return int(np.isinf(uppers_m).all(axis=0).sum()) if uppers_m else None
 
 
-def failing(summary: dict[str, Any]) -> list[str]:
-    """Return the names of the objects that clash or are certainly nearer than they may be."""
+def failing(summary: dict[str, Any], let_pass: Collection[str] = ()) -> list[str]:
+    """Return the names of the objects of which not every frame says that they keep their distance.
+
+    Parameters
+    ----------
+    summary : dict
+        What `summarize` returned.
+    let_pass : collection of str
+        Verdicts besides "kept" that are good enough.
+    """
+    good = {"kept", *let_pass}
     return [
         found["name"]
         for found in summary["objects"]
-        if found["frames_colliding"] or found["frames_inside"] or found["frames_below_required"]
+        if not found["frames_by_verdict"] or not good.issuperset(found["frames_by_verdict"])
     ]
+
+
+def _about_verdict(rows: ObjectColumns) -> dict[str, Any]:
+    counts = Counter(rows.verdict.tolist())
+    return {
+        "verdict": worst(set(counts)),
+        "frames_by_verdict": {one: counts[one] for one in VERDICTS if counts[one]},
+        "why": dict(Counter(_kind(why) for why in rows.why.tolist() if why)),
+    }
+
+
+def _kind(reason: str) -> str:
+    """Return a reason without its numbers, so that reasons of a kind are counted together."""
+    return re.sub(r"\d+(\.\d+)?", "..", reason) if " mm " in reason else reason
 
 
 def _about_touching(
@@ -99,18 +143,8 @@ def _about_touching(
     proved_free = (rows.certificate == "free") & ~rows.is_inside
     has_witness = rows.certificate == "colliding"
     is_open = rows.certificate == "open"
-    if rows.touches.any():
-        verdict = "colliding"
-    elif rows.is_inside.any():
-        verdict = "inside"
-    elif is_valid.any() and proved_free[is_valid].all():
-        verdict = "free"
-    elif is_valid.any() and (proved_free | is_open)[is_valid].all():
-        verdict = "open"
-    else:
-        verdict = "clear" if is_valid.any() else "unknown"
+    offset = rows.patches.get("offset", np.zeros(1, np.uint64))
     return {
-        "verdict": verdict,
         "frames_colliding": int(rows.touches.sum()),
         "frames_sampled_colliding": int(rows.collides.sum()),
         "frames_with_witness": int(has_witness.sum()),
@@ -120,6 +154,7 @@ def _about_touching(
         "open_at_m": float(rows.open_at_m[is_open].max()) if is_open.any() else None,
         "points_most": int(rows.n_points.max(initial=0)),
         "triangles_most": int(rows.n_triangles.max(initial=0)),
+        "patches_most": int(np.diff(offset.astype(np.int64)).max(initial=0)),
         "sample_spacing_m": rows.about.get("sample_spacing_m"),
         "spans": [
             {
@@ -129,7 +164,7 @@ def _about_touching(
                 "stop_s": float(report.time_s[last]),
                 **{name: _plain(rows[name][first]) for name in _ENTRY if name in rows},
             }
-            for first, last in spans(rows.clashes)
+            for first, last in spans(rows.clashes, ~is_valid)
         ],
     }
 
@@ -191,12 +226,23 @@ def _about_clearance(
 
 
 def _about_recovery(rows: ObjectColumns, report: Report) -> dict[str, Any]:
-    if "d_rec_m" not in rows or np.isnan(rows["d_rec_m"]).all():
+    if "d_rec_m" not in rows:
         return {"recovery": None}
-    row = int(np.nanargmax(rows["d_rec_m"]))
+    no_exit = int((rows["response_status"] == "no exit").sum())
+    d_rec_m = rows["d_rec_m"]
+    if np.isnan(d_rec_m).all() and not no_exit:
+        return {"recovery": None}
+    row = int(np.argmax(np.nan_to_num(d_rec_m, nan=-1.0)))
+    frees = rows.get("recovery_frees")
+    asked = np.zeros(len(d_rec_m), np.bool_) if frees is None else frees != ""
+    shift_m = np.nan if frees is None or not asked.any() else rows["free_shift_m"][asked, 1].max()
     return {
         "recovery": {
-            "d_rec_m": float(rows["d_rec_m"][row]),
+            "d_rec_m": _plain(d_rec_m[row]),
+            "frames_no_exit": no_exit,
+            "frames_asked_to_free": int(asked.sum()),
+            "frames_freed": 0 if frees is None else int((frees == "yes").sum()),
+            "free_shift_m": _plain(shift_m),
             "d_rec_paper_m": _plain(rows["d_rec_paper_m"][row]),
             "v_rec": _plain(rows["v_rec"][row]),
             "frame": int(report.index[row]),
@@ -226,13 +272,24 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def spans(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def spans(
+    flags: NDArray[np.bool_], unknown: NDArray[np.bool_] | None = None
+) -> list[tuple[int, int]]:
     """Return the first and last row of each run of true flags.
+
+    Rows of which nothing is known do not end a run that goes on behind them.
 
     Examples
     --------
-    >>> spans(np.array([False, True, True, False, True]))
+    >>> flags = np.array([False, True, True, False, True])
+    >>> spans(flags)
     [(1, 2), (4, 4)]
+    >>> spans(flags, np.array([True, False, False, True, False]))
+    [(1, 4)]
     """
+    if unknown is not None and unknown.any():
+        known = np.flatnonzero(~unknown)
+        runs = spans(flags[known])
+        return [(int(known[first]), int(known[last])) for first, last in runs]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     return [(int(a), int(b) - 1) for a, b in list(pairwise(edges.tolist()))[::2]]

@@ -12,6 +12,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -23,27 +24,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.finding import Finding
+from hybridve.hull.report.collisions import Runs, StoredMesh
 from hybridve.hull.report.schema import (
+    CAMERA_COLUMNS,
     FORMAT,
     FRAME_COLUMNS,
-    OFFSET,
+    MESH_COLUMNS,
+    PATCH_COLUMNS,
+    PATCH_OFFSET,
     POINT_COLUMNS,
+    POINT_OFFSET,
+    RUN_COLUMNS,
+    RUN_OFFSET,
     VERSION,
     Column,
     FrameResult,
     ReportHeader,
     tables_of,
 )
-from hybridve.hull.report.vtk import add_vtkhdf, by_frame
+from hybridve.hull.report.vtk import MOST_SHOWN, FramePoints, add_vtkhdf
 
-#: A part is finished after this many frames or collision points, whichever comes first.
+#: A part is finished after this many frames or runs of collision points, whichever comes first.
 _PART_FRAMES = 64
-_PART_POINTS = 1_000_000
+_PART_RUNS = 250_000
 
-#: Collision points in one chunk of the file.
-_CHUNK_POINTS = 16_384
+#: Rows in one chunk of the file, of those that have many.
+_CHUNK_ROWS = 16_384
 
 _STORED = {
     "compression": "gzip",
@@ -87,6 +94,7 @@ class ReportWriter:
         self._header = header
         self._parts = path.with_name(path.name + ".parts")
         self._pending: list[FrameResult] = []
+        self._n_pending_runs = 0
         self.n_done = 0
         self._write_s = 0.0
         refuse_existing(path, overwrite=overwrite)
@@ -129,8 +137,8 @@ class ReportWriter:
     def append(self, result: FrameResult) -> None:
         """Take in one frame's result."""
         self._pending.append(result)
-        n_points = sum(len(f.contact.triangle) for r in self._pending for f in r.findings)
-        if len(self._pending) >= _PART_FRAMES or n_points >= _PART_POINTS:
+        self._n_pending_runs += sum(len(finding.contact.hits.start) for finding in result.findings)
+        if len(self._pending) >= _PART_FRAMES or self._n_pending_runs >= _PART_RUNS:
             self._flush()
 
     def _flush(self) -> None:
@@ -145,7 +153,7 @@ class ReportWriter:
             np.savez(file, **columns)  # type: ignore[arg-type]  # the stub takes the names for options
         partial.replace(part)
         self.n_done += len(self._pending)
-        self._pending = []
+        self._pending, self._n_pending_runs = [], 0
         self._write_s += time.perf_counter() - started
 
     def take_write_s(self) -> float:
@@ -193,14 +201,21 @@ class ReportWriter:
             text.attrs["unit"] = "1"
             text.attrs["kind"] = "exact"
             text.attrs["description"] = description
+        self._store(file["hybridve/settings"], _ORIGIN, np.array(header.local_origin_m))
+        file["hybridve/settings"].attrs[_ORIGIN.name] = header.local_origin_m
 
-        rows = list(self._part_columns(lambda key: not key.endswith(_POINT_NAMES)))
+        rows = list(self._part_columns(lambda key: not key.endswith(_MANY)))
         if not rows:
             raise ReportError(f"{self._path}: no frame was evaluated; there is nothing to report")
         whole = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
         frames = file.create_group("hybridve/frames")
         for column in FRAME_COLUMNS:
             self._store(frames, column, whole[_frame_key(column.name)])
+        cameras = file.create_group("hybridve/cameras", track_order=True)  # the session's order
+        for number, name in enumerate(header.cameras):
+            group = cameras.create_group(name)
+            for camera_column in CAMERA_COLUMNS:
+                self._store(group, camera_column, whole[_camera_key(number, camera_column.name)])
         objects = file.create_group("hybridve/objects", track_order=True)  # the scene's order
         for number, about in enumerate(header.objects):
             group = objects.create_group(about["name"])
@@ -210,17 +225,20 @@ class ReportWriter:
             for table in tables_of(header.parts):
                 for column in table.columns:
                     self._store(group, column, whole[_object_key(number, column.name)])
-            self._store_points(group, number, whole[_object_key(number, "n_points")])
-        numbers = range(len(header.objects))
-        names = ("n_points", "points/xyz_m", "points/triangle")
+            for offset, columns, count in (
+                (RUN_OFFSET, RUN_COLUMNS, "n_runs"),
+                (PATCH_OFFSET, PATCH_COLUMNS, "n_patches"),
+            ):
+                self._store_many(group, number, offset, columns, whole[_object_key(number, count)])
+            self._store_mesh(file, group, header.meshes[number])
+            if header.points == "all":
+                self._store_points(group, number, whole[_object_key(number, "n_points")])
         add_vtkhdf(
             file,
-            (
-                by_frame(
-                    *([columns[_object_key(number, name)] for number in numbers] for name in names)
-                )
-                for columns in self._part_columns(lambda key: key.endswith(names))
-            ),
+            [about["name"] for about in header.objects],
+            header.meshes,
+            [self._points(number) for number in range(len(header.objects))],
+            is_sample=header.points == "sample",
         )
 
     def _store(self, group: h5py.Group, column: Column[Any], values: NDArray[Any]) -> None:
@@ -238,29 +256,90 @@ class ReportWriter:
         if "C" in column.shape:
             dataset.attrs["cameras"] = list(self._header.cameras)
 
-    def _store_points(self, group: h5py.Group, number: int, n_points: NDArray[np.uint32]) -> None:
-        offset = np.concatenate([[0], np.cumsum(n_points, dtype=np.uint64)]).astype(np.uint64)
-        self._store(group, OFFSET, offset)
-        total = int(offset[-1])
-        # Growing shapes only because HDF5 allows chunks larger than the data in no others.
-        chunk = _CHUNK_POINTS if total > _CHUNK_POINTS else max(total, 1)
-        for column in POINT_COLUMNS:
-            dataset = group.create_dataset(
-                column.name,
-                (total, *column.shape),
-                column.dtype,
-                chunks=(chunk, *column.shape),
-                maxshape=(None, *column.shape),
-                **_STORED,
-            )
-            self._describe(dataset, column)
+    def _store_many(
+        self,
+        group: h5py.Group,
+        number: int,
+        offset: Column[Any],
+        columns: Sequence[Column[Any]],
+        counts: NDArray[np.int64],
+    ) -> None:
+        """Store what a frame has any number of, part by part."""
+        ends = np.concatenate([[0], np.cumsum(counts, dtype=np.uint64)]).astype(np.uint64)
+        self._store(group, offset, ends)
+        for column in columns:
             key = _object_key(number, column.name)
-            start = 0
-            for columns in self._part_columns(partial(operator.eq, key)):
-                stop = start + len(columns[key])
-                if stop > start:
-                    dataset[start:stop] = columns[key]
-                start = stop
+            parts = (part[key] for part in self._part_columns(partial(operator.eq, key)))
+            self._store_parts(group, column, int(ends[-1]), parts)
+
+    def _store_points(self, group: h5py.Group, number: int, n_points: NDArray[np.uint64]) -> None:
+        ends = np.concatenate([[0], np.cumsum(n_points, dtype=np.uint64)]).astype(np.uint64)
+        self._store(group, POINT_OFFSET, ends)
+        xyz_m, triangle = POINT_COLUMNS
+        total = int(ends[-1])
+        self._store_parts(group, xyz_m, total, (part.xyz_m for part in self._points(number)))
+        self._store_parts(group, triangle, total, (part.triangle for part in self._points(number)))
+
+    def _store_parts(
+        self, group: h5py.Group, column: Column[Any], total: int, parts: Iterator[NDArray[Any]]
+    ) -> None:
+        # Growing shapes only because HDF5 allows chunks larger than the data in no others.
+        chunk = _CHUNK_ROWS if total > _CHUNK_ROWS else max(total, 1)
+        dataset = group.create_dataset(
+            column.name,
+            (total, *column.shape),
+            column.dtype,
+            chunks=(chunk, *column.shape),
+            maxshape=(None, *column.shape),
+            **_STORED,
+        )
+        self._describe(dataset, column)
+        start = 0
+        for values in parts:
+            stop = start + len(values)
+            if stop > start:
+                dataset[start:stop] = values
+            start = stop
+
+    def _store_mesh(self, file: h5py.File, group: h5py.Group, mesh: StoredMesh) -> None:
+        """Store a mesh; vertices and faces of objects that share them stand in the file once."""
+        digest = mesh.sha256
+        shared = file.require_group(f"hybridve/meshes/{digest}")
+        for column in MESH_COLUMNS:
+            name = column.name.removeprefix("mesh/")
+            if name in ("vertices_m", "faces"):
+                if name not in shared:
+                    self._store(shared, replace(column, name=name), column.take(mesh))
+                group[column.name] = shared[name]  # a hard link
+            else:
+                self._store(group, column, column.take(mesh))
+        group["mesh"].attrs["sha256"] = digest
+
+    def _points(self, number: int) -> Iterator[FramePoints]:
+        """Yield of each part the collision points of an object, all or a sample of them."""
+        mesh, row = self._header.meshes[number], 0
+        names = ("n_runs", *(column.name for column in RUN_COLUMNS))
+        keys = [_object_key(number, name) for name in names]
+        for columns in self._part_columns(keys.__contains__):
+            counts, triangle, first, count = (columns[key] for key in keys)
+            runs, start = Runs(triangle, first, count), 0
+            xyz_m = [np.zeros((0, 3), np.float32)]
+            triangles = [np.zeros(0, np.uint32)]
+            for n_runs in counts.tolist():
+                of_frame = runs.part(start, start + n_runs)
+                if self._header.points == "sample":
+                    of_frame = of_frame.thinned(mesh, MOST_SHOWN)
+                if n_runs:
+                    points_m, on = mesh.points(of_frame, row)
+                    xyz_m.append(points_m.astype(np.float32))
+                    triangles.append(on)
+                else:
+                    xyz_m.append(xyz_m[0])
+                    triangles.append(triangles[0])
+                start += n_runs
+                row += 1
+            n_points = np.array([len(one) for one in triangles[1:]], np.int64)
+            yield FramePoints(n_points, np.concatenate(xyz_m), np.concatenate(triangles))
 
     def __enter__(self) -> Self:
         return self
@@ -298,12 +377,26 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
         raise ReportError(f"{path}: cannot be written: no permission to write to {folder}")
 
 
-#: Ends of the keys under which a part keeps what belongs to collision points.
-_POINT_NAMES = tuple(column.name for column in POINT_COLUMNS)
+#: Where the places of the file begin.
+_ORIGIN: Column[Any] = Column(
+    "local_origin_m",
+    "m",
+    "exact",
+    "places in this file are metres about this point of the world: world = place + local_origin_m",
+    np.float64,
+    lambda origin: origin,
+)
+
+#: Ends of the keys under which a part keeps what a frame has any number of.
+_MANY = (*(run.name for run in RUN_COLUMNS), *(patch.name for patch in PATCH_COLUMNS))
 
 
 def _frame_key(name: str) -> str:
     return f"frame/{name}"
+
+
+def _camera_key(number: int, name: str) -> str:
+    return f"camera/{number}/{name}"
 
 
 def _object_key(number: int, name: str) -> str:
@@ -312,35 +405,67 @@ def _object_key(number: int, name: str) -> str:
 
 def _columns(results: list[FrameResult], header: ReportHeader) -> dict[str, NDArray[Any]]:
     """Return the arrays of one part."""
-    n_cameras = len(header.cameras)
-    columns = {
-        _frame_key(column.name): _values(column, results, n_cameras) for column in FRAME_COLUMNS
-    }
+
+    def values(column: Column[Any], rows: Sequence[Any]) -> NDArray[Any]:
+        return _values(column, rows, results, header)
+
+    columns = {_frame_key(column.name): values(column, results) for column in FRAME_COLUMNS}
+    for number in range(len(header.cameras)):
+        shares = [
+            result.object_share[number] if result.object_share else None for result in results
+        ]
+        for camera_column in CAMERA_COLUMNS:
+            columns[_camera_key(number, camera_column.name)] = values(camera_column, shares)
     for number in range(len(header.objects)):
         findings = [result.findings[number] if result.is_valid else None for result in results]
         for table in tables_of(header.parts):
             rows = [None if finding is None else table.of(finding) for finding in findings]
             for column in table.columns:
-                columns[_object_key(number, column.name)] = _values(column, rows, n_cameras)
-        for points in POINT_COLUMNS:
-            columns[_object_key(number, points.name)] = _joined(points, findings)
+                columns[_object_key(number, column.name)] = values(column, rows)
+        runs = [_runs(finding) for finding in findings]
+        columns[_object_key(number, "n_runs")] = np.array([len(one) for one in runs], np.int64)
+        for run_column in RUN_COLUMNS:
+            columns[_object_key(number, run_column.name)] = np.concatenate(
+                [run_column.take(one) for one in runs]
+            )
+        patches = [() if finding is None else finding.patches for finding in findings]
+        columns[_object_key(number, "n_patches")] = np.array(
+            [len(one) for one in patches], np.int64
+        )
+        every = [patch for of_frame in patches for patch in of_frame]
+        for patch_column in PATCH_COLUMNS:
+            columns[_object_key(number, patch_column.name)] = values(patch_column, every)
     return columns
 
 
-def _values(column: Column[Any], rows: Sequence[Any], n_cameras: int) -> NDArray[Any]:
-    """Return one value a row, (F, *shape)."""
+_NO_RUNS = Runs(np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros(0, np.uint32))
+
+
+def _runs(finding: Finding | None) -> Runs:
+    if finding is None or not finding.contact.collides:
+        return _NO_RUNS
+    hits = finding.contact.hits
+    numbers = finding.contact.body.numbers
+    return Runs.of(hits.start, hits.stop, hits.topology.samples_before, numbers)
+
+
+def _values(
+    column: Column[Any], rows: Sequence[Any], results: list[FrameResult], header: ReportHeader
+) -> NDArray[Any]:
+    """Return one value a row, (F, *shape); rows that are None are those of their frame's result."""
+
+    def missing(number: int) -> Any:
+        return column.fill if column.absent is None else column.absent(results[number])
+
     if column.dtype is str:  # as wide as the longest text
-        return np.array(["" if row is None else column.take(row) for row in rows], np.str_)
+        texts = [
+            missing(number) if row is None else column.take(row) for number, row in enumerate(rows)
+        ]
+        return np.array(texts, np.str_)
     values: NDArray[Any] = np.full(
-        (len(rows), *column.shape_of(n_cameras)), column.fill, column.dtype
+        (len(rows), *column.shape_of(len(header.cameras))), column.fill, column.dtype
     )
     for number, row in enumerate(rows):
         if row is not None:
             values[number] = column.take(row)
-    return values
-
-
-def _joined(column: Column[Contact], findings: Sequence[Finding | None]) -> NDArray[Any]:
-    """Return the values of all points of all rows, (P, *shape)."""
-    none: NDArray[Any] = np.zeros((0, *column.shape_of(0)), column.dtype)
-    return np.concatenate([none, *(column.take(f.contact) for f in findings if f is not None)])
+    return values - np.array(header.local_origin_m) if column.is_place else values

@@ -37,7 +37,6 @@ from hybridve.hull.sweep.truth import (
     longest_edges,
     nearest_distances,
     sample_body,
-    touched_triangles,
 )
 
 #: Points of the truth kept of one object in one frame, beside the witnesses.
@@ -332,7 +331,7 @@ def _judge_row(
             one = truth[number][index]
             n_points += len(hits)
             touched = np.zeros(len(one.verdict), np.bool_)
-            touched[touched_triangles(hits)[0]] = True
+            touched[hits.touched()[0]] = True
             triangles_missed += int((~touched & (one.verdict == COLLIDING)).sum())
             against_proof += int((touched & (one.verdict == FREE)).sum())
             if one.collides and len(hits) == 0:

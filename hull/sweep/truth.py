@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from hybridve.hull.contact.detect import Body
-from hybridve.hull.query.engine import Engine, Hits, Triangles
+from hybridve.hull.query.engine import Engine, Triangles
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import MAX_VIEWPORT, sample_positions
@@ -140,7 +140,7 @@ def sample_body(
     precision, are colliding: the sample is their witness.
     """
     (hits,) = engine.query(hull, [dense])
-    touched, first = touched_triangles(hits)
+    touched, first = hits.touched()
     is_open = truth.verdict[touched] == OPEN
     touched, first = touched[is_open], first[is_open]
     witnesses_world = _positions(dense, touched, first)
@@ -150,49 +150,13 @@ def sample_body(
     return BodyTruth(
         verdict,
         np.concatenate([truth.witnesses_world, witnesses_world[stands]]),
-        _positions(dense, *thinned_samples(hits, points_most)),
+        _positions(dense, *hits.thinned(points_most)),
         truth.open_at_m,
     )
 
 
-def touched_triangles(hits: Hits) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the triangles with a sample inside, ascending, and the first such sample of each.
-
-    Without writing out the samples, which may be millions.
-    """
-    before = hits.topology.samples_before
-    first = np.searchsorted(before, hits.start, side="right") - 1
-    last = np.searchsorted(before, hits.stop - 1, side="right") - 1
-    steps = np.zeros(len(before), np.int64)
-    np.add.at(steps, first, 1)
-    np.add.at(steps, last + 1, -1)
-    triangle = np.flatnonzero(np.cumsum(steps[:-1]) > 0)
-    sample = np.zeros(len(triangle), np.int64)
-    # A run begins in its first triangle and goes on from sample 0 of those that follow. Where a
-    # run from before reaches into the triangle, sample 0 is the first.
-    begins, run = np.unique(first, return_index=True)
-    at = np.searchsorted(triangle, begins)
-    sample[at] = hits.start[run] - before[begins]
-    reached = np.unique(last[last > first])
-    sample[np.searchsorted(triangle, reached)] = 0
-    return triangle, sample
-
-
-def thinned_samples(hits: Hits, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return triangle and sample of every k-th of the samples inside, at most so many."""
-    lengths = hits.stop - hits.start
-    ends = np.cumsum(lengths)
-    total = int(ends[-1]) if len(ends) else 0
-    pick = np.arange(0, total, max(1, -(-total // most)))
-    run = np.searchsorted(ends, pick, side="right")
-    number = hits.start[run] + pick - (ends[run] - lengths[run])
-    before = hits.topology.samples_before
-    triangle = np.searchsorted(before, number, side="right") - 1
-    return triangle, number - before[triangle]
-
-
 def nearest_distances(
-    points_world: NDArray[np.float64], reported_world: NDArray[np.float32]
+    points_world: NDArray[np.float64], reported_world: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return how far each of N points is from the nearest of P > 0 reported ones, (N,) metres."""
     # Points on a lattice are spread evenly: a balanced tree would take longer to build than to ask.

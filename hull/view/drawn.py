@@ -22,7 +22,7 @@ class DrawnObject:
         Whether it is drawn as colliding.
     hit_triangles : (K,) uint32
         Numbers of the triangles with collision points.
-    hit_points_world : (P, 3) float32
+    hit_points_world : (P, 3) float64
         The collision points, in metres.
     """
 
@@ -31,7 +31,7 @@ class DrawnObject:
     faces: NDArray[np.int32]
     collides: bool
     hit_triangles: NDArray[np.uint32]
-    hit_points_world: NDArray[np.float32]
+    hit_points_world: NDArray[np.float64]
 
     @property
     def corners_world(self) -> NDArray[np.float64]:

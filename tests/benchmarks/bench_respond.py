@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.contacts import contact_at
 from helpers.hulls import ball_hull, ring_views
 from helpers.response import angle_deg, ball_exits, random_unit
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.respond import Response, ResponseSettings, respond
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.walk import boundary_cameras, silhouette_normal, spans_in_hull
@@ -70,7 +70,7 @@ def bench_respond(benchmark: Any, hull: Hull, points: Points, window: int) -> No
     settings = ResponseSettings(window=window)
 
     def answer(start: NDArray[np.float64], unit: NDArray[np.float64]) -> Response:
-        contact = Contact("", start[None].astype(np.float32), np.zeros(1, np.uint32))
+        contact = contact_at(start)
         return respond(hull, contact, reference_point_world=start + unit, settings=settings)
 
     answers = [(answer(start, unit), normal) for start, unit, normal in points]

@@ -1,13 +1,13 @@
 """Rays and responses, whatever the rig and the silhouettes; the specification is the witness."""
 
 import numpy as np
+from helpers.contacts import contact_at
 from helpers.hulls import MASK_KINDS, random_masks, random_views
 from helpers.response import camera_center, random_unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.respond import Response, ResponseSettings, respond
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull
@@ -109,7 +109,7 @@ def collisions(draw: st.DrawFn) -> tuple[Hull, NDArray[np.float64], Response, Re
     )
     answer = respond(
         hull,
-        Contact("", start[None].astype(np.float32), np.zeros(1, np.uint32)),
+        contact_at(start),
         reference_point_world=start + unit * draw(st.sampled_from([0.001, 0.1, 1.0])),
         recovery_direction=draw(st.sampled_from([None, 3.0 * unit])),
         settings=chosen,

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 from helpers.cones import BOX_FACES, box_vertices, views_from
+from helpers.contacts import FREE
 from helpers.hulls import (
     EMPTYING_MASK_KINDS,
     MASK_KINDS,
@@ -17,7 +18,6 @@ from hypothesis import strategies as st
 from hybridve.hull.contact.bulge import Ray, farthest_on, real_upper
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
-from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
 from hybridve.hull.query.silhouettes import Hull, Unseen, make_hull
 
@@ -86,7 +86,7 @@ def test_a_doubt_does_not_depend_on_what_was_doubted_before(
     seed: int, n_cameras: int, n_balls: int
 ) -> None:
     hull, _ = hull_beside_box(seed, n_cameras, n_balls)
-    free = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+    free = FREE
     doubter = Doubter(outline_errors(hull.views.names, {}, [0.0] * len(hull.views)))
     fresh = ClearanceMeter(
         box_vertices(np.zeros(3), BOX_HALF_M), BOX_FACES, is_closed=True, tolerance_m=5e-4
@@ -112,7 +112,7 @@ def test_whatever_the_silhouettes_a_doubt_agrees_with_itself(
     kinds = rng.choice(MASK_KINDS * 3 + EMPTYING_MASK_KINDS, n_cameras).tolist()
     hull = make_hull(views, random_masks(rng, views, kinds))
     clearance = meter().measure(hull)
-    contact = Contact("free", np.zeros((0, 3), np.float32), np.zeros(0, np.uint32))
+    contact = FREE
     doubter = Doubter(
         outline_errors(views.names, {}, [0.0] * n_cameras), DoubtSettings(cell_m=0.2, near_m=np.inf)
     )
