@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SessionError
 from hybridve.hull.capture.background import SAMPLE_FRAMES, learn_background
 
-_FEW = settings(max_examples=20, deadline=None)
+_FEW = settings(max_examples=20)
 
 #: Grey levels by which a mean of 20 or more frames with noise of 3 may be off: 5 sigma, and half a
 #: level because values were rounded.

@@ -20,7 +20,7 @@ from hybridve.calib.image_io import FrameSource, open_source, read_image
 from hybridve.hull.capture.background import Background, learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings, clean, threshold_mask
 
-_FEW = settings(max_examples=20, deadline=None)
+_FEW = settings(max_examples=20)
 
 WIDTH, HEIGHT = 160, 120
 NOISE = 2.0  # grey levels
@@ -377,7 +377,7 @@ def cleaned_by_opencv(mask: Bytes, speck_px: int, hole_px: int) -> Bytes:
     return result
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     seed=seeds,
     width=st.integers(1, 40),

@@ -103,7 +103,7 @@ def test_what_a_camera_does_not_see_is_not_in_the_hull() -> None:
     np.testing.assert_array_equal(inside, in_sight)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(place=places, radius_m=sizes, offset=offsets, camera=st.integers(0, 3))
 def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
     place: NDArray[np.float64], radius_m: float, offset: NDArray[np.float64], camera: int
@@ -126,7 +126,7 @@ def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
     assert beyond.distance_m == np.inf
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     place=places,
     sizes_m=st.tuples(sizes, sizes, sizes),

@@ -166,7 +166,7 @@ def test_a_ray_enters_where_the_distance_first_vanishes(
         assert shape.signed_distance(rest)[0].min() > -1e-6
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     corners=st.lists(points, min_size=3, max_size=9),
     first=st.tuples(shapes, poses),
@@ -198,7 +198,6 @@ def test_the_closest_point_agrees_with_dense_samples_of_the_surface(
     assert distance(shape, local) == pytest.approx(found.distance_m, abs=10 * ROUNDING_M)
 
 
-@settings(deadline=None)
 @given(half=st.tuples(sizes, sizes, sizes), center=points, radius_m=sizes, world_from_mesh=poses)
 def test_a_ball_outside_a_box_of_triangles_is_as_far_as_outside_the_box(
     half: tuple[float, float, float],
@@ -220,7 +219,6 @@ def test_a_ball_outside_a_box_of_triangles_is_as_far_as_outside_the_box(
     assert -10 * ROUNDING_M <= excess_m <= TOLERANCE_M + 10 * ROUNDING_M
 
 
-@settings(deadline=None)
 @given(gap_m=st.floats(-0.02, 0.2), shift_m=st.floats(-0.03, 0.03))
 def test_parallel_faces_are_as_far_apart_as_they_are(gap_m: float, shift_m: float) -> None:
     # The whole face is nearest: the worst case for a search that drops what is farther.
