@@ -14,8 +14,8 @@ from hybridve.hull.capture.background import SAMPLE_FRAMES, learn_background
 
 _FEW = settings(max_examples=20)
 
-#: How far a mean of 20 or more values with noise of 3 is off, 1 sigma in grey levels, at most: where
-#: few values are near the middle one, little else counts, and that is as rough as a median.
+#: How far a mean of 20 or more values with noise of 3 is off at most, 1 sigma in grey levels: where
+#: few values are near the middle one, the others do not count, and it is as rough as a median.
 MEAN_SIGMA = 1.25 * 3 / np.sqrt(20)
 
 #: The same of 3600 values: 6.4 sigma, and half a level because values were rounded; once in 1e6.
