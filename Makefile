@@ -1,12 +1,13 @@
 # make demo    the whole job on a generated session
 # make test    everything that must hold: style, types, import contracts, tests
+# make soak    the property tests with new examples: RUNS=10 times, SEED=1 and up, TESTS=some files
 # make bench   the benchmarks, with the numbers of the README
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
 # make lock    renew requirements.lock after a change of pyproject.toml
 
 BIN := .venv/bin
 
-.PHONY: demo test check pytest bench theory lock setup clean
+.PHONY: demo test check pytest soak bench theory lock setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -20,8 +21,14 @@ check: setup
 	$(BIN)/lint-imports
 
 # Files of tests side by side; one file stays with one process, so that fixtures are made once.
+# Property tests are asked the same examples in every run, on every machine.
 pytest: setup
 	$(BIN)/pytest -n auto --dist loadfile --benchmark-disable
+
+# New examples, a seed a round: RUNS rounds (1), seeds from SEED up (drawn), of the tests in TESTS
+# (all that draw). The first round that is red ends it, and says how to repeat just that round.
+soak: setup
+	@RUNS="$(RUNS)" SEED="$(SEED)" TESTS="$(TESTS)" bash .ci/soak
 
 bench: setup
 	$(BIN)/pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' \

@@ -90,7 +90,7 @@ def test_offsets_are_found_to_a_fraction_of_a_frame() -> None:
     assert not clocks.notes
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(late=st.floats(-12.0, 12.0), other=st.floats(-12.0, 12.0))
 def test_any_offset_is_found(late: float, other: float) -> None:
     true = {"cam1": 0.0, "cam2": late, "cam3": other}

@@ -269,9 +269,13 @@ def test_a_file_that_did_not_change_is_not_read_again(
 
 
 def test_a_file_just_written_is_read_again_whatever_its_times_say(
-    folder: Path, tmp_path: Path, reads: Callable[[], int]
+    folder: Path, tmp_path: Path, reads: Callable[[], int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write(tmp_path / "a", b"123", age_s=0.0)
+    found = path.stat()
+    monkeypatch.setattr(
+        corner_cache.time, "time_ns", lambda: max(found.st_mtime_ns, found.st_ctime_ns) + 1
+    )
     cache = CornerCache(folder)
 
     cache.identify([path])

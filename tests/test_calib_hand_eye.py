@@ -94,7 +94,7 @@ def apart(first: Mount, second: Mount) -> float:
     return max(max(angle_between(a, b), float(np.linalg.norm(a[:, 3] - b[:, 3]))) for a, b in pairs)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n_instants=st.integers(5, 30))
 def test_random_motions_give_the_mount_back_in_closed_form(seed: int, n_instants: int) -> None:
     rng = np.random.default_rng(seed)

@@ -83,7 +83,7 @@ def test_a_chain_of_cameras_that_see_a_board_with_the_next_only() -> None:
     assert not linked.warnings
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(order=st.permutations(range(4)), seed=st.integers(0, 1000))
 def test_the_order_of_cameras_and_views_changes_no_bit(order: Sequence[int], seed: int) -> None:
     recording = passing_by(4, seed=seed, noise_px=0.3, stills=2)
@@ -301,7 +301,7 @@ def test_boards_of_one_body_never_seen_together_are_named() -> None:
         link(recording)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000))
 def test_two_unknown_poses_are_found_together(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -334,7 +334,7 @@ def test_a_body_turned_about_one_axis_tells_too_little() -> None:
 # --- Symmetric boards ------------------------------------------------------------------------
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 1000))
 def test_frames_tell_which_way_round_a_symmetric_board_was_seen(seed: int) -> None:
     turns = np.random.default_rng(seed).integers(0, 2, (3, 200))

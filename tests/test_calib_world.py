@@ -86,7 +86,7 @@ def assert_same(placed: Placed, world_from_rig: Pose) -> None:
     assert json.loads(json.dumps(placed.diagnostics)) == placed.diagnostics
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1000))
 def test_all_ways_find_the_same_world(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -20,7 +20,7 @@ from hybridve.calib.image_io import FrameSource, open_source, read_image
 from hybridve.hull.capture.background import Background, learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings, clean, threshold_mask
 
-_FEW = settings(max_examples=20, deadline=None)
+_FEW = settings(max_examples=20)
 
 WIDTH, HEIGHT = 160, 120
 NOISE = 2.0  # grey levels
@@ -185,22 +185,27 @@ def test_an_object_is_told_from_the_shadow_it_casts(
 
 
 @_FEW
-@given(seed=seeds, factor=st.floats(0.6, 0.8))
+@given(seed=seeds, level=st.floats(180, 220), square_px=st.integers(1, 4), x=st.integers(0, WIDTH))
 def test_what_has_the_colour_of_a_shadow_but_not_the_texture_is_an_object(
-    seed: int, factor: float
+    seed: int, level: float, square_px: int, x: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    scene = a_scene(rng)
-    truth = ellipse((80, 60), (30, 20), 0)
+    scene = level * np.ones((HEIGHT, WIDTH, 1)) * (0.9, 1.05, 0.85)
+    truth = ellipse((x, 60), (30, 20), 0)
     segmenter = a_segmenter(rng, scene)
 
-    # Its brightness goes up and down by half every few pixels, as with windows and wheels.
-    layer = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 1)
-    uneven = np.clip(factor * (1 + 0.5 * layer / layer.std()), 0.1, 2)
-    painted = scene * np.where(truth > 0, uneven, 1)[..., None]
+    # A chessboard of two shadows. Any 7 x 7 pixels have as many of both, but for one, so that each
+    # factor is off their mean by 0.181; an object is what is off by 0.143 (the shadow's threshold,
+    # the share of unseen colours and the least variation of a shade, at the darkest level). Noise
+    # adds 0.006 to a factor: between the two there are 6 sigma, and it takes five pixels of nine.
+    rows, columns = np.indices((HEIGHT, WIDTH)) // square_px
+    factor = np.where((rows + columns) % 2 == 1, 0.5, 0.87)
+    painted = scene * np.where(truth > 0, factor, 1)[..., None]
     mask = segmenter.segment(recorded(rng, painted))
 
-    assert mask[truth > 0].mean() > 0.6, "0.76 to 0.95 in trials"
+    # Of what is nearer to the border than the 7 x 7 pixels reach, the scene around may be part.
+    window = np.ones((9, 9), np.uint8)
+    assert mask[cv2.erode(truth, window, borderType=cv2.BORDER_REPLICATE) > 0].all()
     assert not (mask & ~cv2.dilate(truth, np.ones((3, 3), np.uint8)) & 1).any()
 
 
@@ -377,7 +382,7 @@ def cleaned_by_opencv(mask: Bytes, speck_px: int, hole_px: int) -> Bytes:
     return result
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     seed=seeds,
     width=st.integers(1, 40),

@@ -44,7 +44,7 @@ def smooth(rng: np.random.Generator, sigma_px: float) -> NDArray[np.float64]:
     return np.asarray(layer / layer.std())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     gain=st.floats(0.9, 1.1),

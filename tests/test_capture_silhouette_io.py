@@ -13,7 +13,8 @@ from hybridve.calib.errors import ReportError
 from hybridve.hull.capture.silhouette_io import SilhouetteReader, SilhouetteWriter
 
 _FEW = settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=25,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
 Masks = list[NDArray[np.uint8]]

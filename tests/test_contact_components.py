@@ -166,7 +166,7 @@ def hulls(draw: st.DrawFn) -> Hull:
     return make_hull(views, random_masks(rng, views, rng.choice(MASK_KINDS, n_cameras).tolist()))
 
 
-@settings(max_examples=25, derandomize=True)
+@settings(max_examples=25)
 @given(hull=hulls(), seed=st.integers(0, 2**32 - 1))
 def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
     hull: Hull, seed: int
@@ -189,7 +189,7 @@ def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
         assert (found == found[0]).all()
 
 
-@settings(max_examples=40, derandomize=True)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(2, 5), n_balls=st.integers(1, 4))
 def test_what_is_called_real_holds_a_part_of_a_real_ball(
     seed: int, n_cameras: int, n_balls: int

@@ -63,7 +63,7 @@ def test_a_thing_smaller_than_the_witness_rays_are_apart_is_not_lost() -> None:
     assert [int(mask.sum()) for mask in result] == [1] * N_CAMERAS
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), unseen=st.sampled_from(["carve", "keep"]))
 def test_the_hull_is_the_same_at_every_point(seed: int, unseen: str) -> None:
     rng = np.random.default_rng(seed)

@@ -39,7 +39,9 @@ from hybridve.hull.query.silhouettes import Hull, make_hull, make_views
 #: Coarse, so that triangles of metres stay within some thousand cells.
 OPEN_AT_M = 0.01
 
-examples = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+examples = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 
 
 @pytest.fixture(scope="module")

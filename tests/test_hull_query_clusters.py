@@ -46,7 +46,7 @@ def again(hull: Hull) -> Hull:
 @pytest.mark.usefixtures("_deep_trees")
 @settings(
     max_examples=60,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridve.hull.query.viewport import (
@@ -88,7 +88,6 @@ def test_an_accuracy_beyond_every_viewport_is_refused() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), largest=st.integers(1, 40))
-@settings(deadline=None)  # the first example compiles
 def test_hits_are_positioned_to_the_bits_of_the_specification(seed: int, largest: int) -> None:
     rng = np.random.default_rng(seed)
     vertices = rng.normal(size=(9, 3)) * 10.0 ** rng.integers(-3, 4)

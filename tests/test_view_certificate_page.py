@@ -334,7 +334,7 @@ def words_of(value: Any) -> list[str]:
     return [value] if isinstance(value, str) else []
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(value=PLAIN)
 def test_every_word_of_the_details_is_there_however_nested(value: Any) -> None:
     page = Page(render(value))

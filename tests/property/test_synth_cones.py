@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, project_points
 from hybridve.calib.pose import Pose, rotation_about_axes, transform
 from hybridve.hull.capture.synth.cones import RESOLUTION_M, Surface, TrueHull
@@ -46,6 +47,13 @@ def test_a_point_is_in_the_hull_of_a_ball_if_every_tangent_cone_holds_it(
     assert inside == (min(margins) > 0)
 
 
+@example(
+    place=np.array([0.125, 5e-324, 0.5]),
+    other=np.array([0.125, 5e-324, 0.5]),
+    radius_m=0.02,
+    rotate_deg=(0.0, 0.0, 0.0),
+    offset=np.zeros(3),
+)
 @given(
     place=places,
     other=places,
@@ -103,7 +111,48 @@ def test_what_a_camera_does_not_see_is_not_in_the_hull() -> None:
     np.testing.assert_array_equal(inside, in_sight)
 
 
-@settings(deadline=None, max_examples=60)
+def looking_along_z(center: tuple[float, float, float]) -> Camera:
+    pose = np.column_stack([np.eye(3), -np.array(center)])
+    return Camera("ahead", "PINHOLE", 640, 480, np.array([500.0, 500, 320, 240]), pose)
+
+
+def test_a_camera_beside_a_long_thing_sees_the_end_that_is_ahead() -> None:
+    # Its middle lies behind the camera, and one end ahead, more than a right angle away.
+    camera, bar = looking_along_z((0.0, 0.0, 0.0)), Box(0.01, 0.01, 1.3)
+    pose = np.column_stack([rotation_about_axes((0.0, 61.4, 0.0)), [-1.0, 0.0, -0.1]])
+    ahead = 0.9 * transform(pose, np.array([[0.0, 0.0, 1.25]]))
+
+    hull = TrueHull([camera], [bar], [pose])
+
+    assert hull.contains(ahead).all()
+
+
+@pytest.mark.parametrize("depth_m", [0.0, 5e-324, 2.7e-162, -5e-324])
+@pytest.mark.parametrize("across", [0.0, 0.02, 0.2, 1e300])
+def test_points_next_to_a_camera_are_in_the_hull_if_its_ray_through_them_meets_a_shape(
+    depth_m: float, across: float
+) -> None:
+    camera = looking_along_z((0.0, 0.0, 0.0))
+    point = np.array([[across * depth_m, 0.0, depth_m]])
+
+    (inside,) = TrueHull([camera], [Ball(0.1)], [at(np.array([0.0, 0.0, 1.0]))]).contains(point)
+
+    # The ball is seen to a slope of 0.1; of the smallest number there is, 0.2 is nothing.
+    assert inside == (depth_m > 0 and point[0, 0] <= 0.1 * depth_m)
+
+
+def test_cells_that_hold_a_camera_hide_nothing_of_the_hull() -> None:
+    # One of the first cells reaches from behind the camera, where its middle is, to before it.
+    camera = looking_along_z((0.0, 0.0, 0.0))
+    speck = np.array([[[0.0, 0, -0.2], [1e-7, 0, -0.2], [0, 1e-7, -0.2]]])
+    hull = TrueHull([camera], [Ball(0.1)], [at(np.array([0.0, 0.0, 1.0]))])
+
+    found = hull.distance(Surface(speck), within_m=1.0)
+
+    assert 0.2 - 1e-6 <= found.distance_m <= 0.2 + RESOLUTION_M
+
+
+@settings(max_examples=60)
 @given(place=places, radius_m=sizes, offset=offsets, camera=st.integers(0, 3))
 def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
     place: NDArray[np.float64], radius_m: float, offset: NDArray[np.float64], camera: int
@@ -126,7 +175,7 @@ def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
     assert beyond.distance_m == np.inf
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     place=places,
     sizes_m=st.tuples(sizes, sizes, sizes),
@@ -192,6 +241,43 @@ def test_a_surface_is_as_near_as_the_nearest_of_its_dense_samples(
         assert sampled - spacing_m <= distance_m <= sampled + 1e-9
         assert np.linalg.norm(place - point) == pytest.approx(distance_m, abs=1e-12)
         assert np.linalg.norm(samples - place, axis=1).min() <= spacing_m
+
+
+@given(
+    corners=st.lists(offsets, min_size=2, max_size=2),
+    share=st.floats(0.0, 1.0),
+    point=offsets,
+    order=st.permutations(range(3)),
+)
+@example([np.zeros(3), np.zeros(3)], 0.5, np.array([0.1, 0.0, 0.0]), [0, 1, 2])
+@example([np.zeros(3), np.array([5e-324, 0.0, 0.0])], 1.0, np.zeros(3), [0, 1, 2])
+@example([np.zeros(3), np.array([2.7e-162, 0.0, 0.0])], 0.5, np.zeros(3), [2, 0, 1])
+def test_a_triangle_without_area_is_as_near_as_the_line_that_it_is(
+    corners: list[NDArray[np.float64]],
+    share: float,
+    point: NDArray[np.float64],
+    order: list[int],
+) -> None:
+    start, stop = corners
+    way = stop - start
+    triangle = np.array([start, stop, start + share * way])[order]
+    length2 = float(way @ way)
+    nearest = start + (np.clip((point - start) @ way / length2, 0, 1) if length2 else 0.0) * way
+
+    (distance_m,), (place,) = Surface(triangle[None]).distance(point[None])
+
+    assert distance_m == pytest.approx(np.linalg.norm(point - nearest), abs=1e-9)
+    assert np.linalg.norm(point - place) == pytest.approx(distance_m, abs=1e-12)
+
+
+@pytest.mark.parametrize("side_m", [1.0, 1e-3, 1e-120, 1e-170])
+def test_a_triangle_is_as_near_as_it_is_however_small(side_m: float) -> None:
+    triangle = side_m * np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
+    point = side_m * np.array([[0.25, 0.25, 0.0]]) + [0.0, 0.0, 0.5]
+
+    (distance_m,), _ = Surface(triangle).distance(point)
+
+    assert distance_m == pytest.approx(0.5, abs=1e-15)
 
 
 def test_a_witness_shortens_the_search_and_leaves_the_answer() -> None:

@@ -28,7 +28,7 @@ def view(camera: int) -> View:
     return make_view(PRESETS["boxes"].make_stage().cameras[camera])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(camera=st.integers(0, 3), place=places, radius_m=sizes)
 def test_silhouette_of_a_ball_is_its_tangent_cone(
     camera: int, place: tuple[float, float, float], radius_m: float
@@ -63,7 +63,7 @@ def test_silhouette_of_a_ball_is_its_tangent_cone(
             assert bool(silhouette[row, column]) == (inside_px > 0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     camera=st.integers(0, 3),
     place=places,
@@ -108,7 +108,6 @@ def silhouette_size(camera: int) -> np.ndarray:
     return np.array([view(camera).camera.width_px, view(camera).camera.height_px])
 
 
-@settings(deadline=None)
 @given(camera=st.integers(0, 3))
 def test_nothing_is_seen_behind_the_camera(camera: int) -> None:
     from_cam = view(camera).camera

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.pose import Pose, invert, transform
-from hybridve.hull.capture.synth.shapes import Shape
+from hybridve.hull.capture.synth.shapes import Shape, lengths_and_units
 
 Floats = NDArray[np.float64]
 
@@ -43,6 +43,13 @@ _STEEPEST_LENS = 1.1
 #: Roots of the search along the longest side of the region.
 _ROOTS = 6
 
+#: A triangle of which two sides enclose an angle with a lesser sine is measured as its three sides:
+#: it lies within this of them, as a share of its size, and its normal may be wrong by that much.
+_SINE_OF_A_LINE = 1e-8
+
+#: Nothing so near to the plane through a camera's centre, as a share of its distance, is in sight.
+_IN_SIGHT = 1e-9
+
 #: The eight parts of a cell.
 _PARTS = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]), axis=-1).reshape(-1, 3)
 
@@ -53,7 +60,7 @@ class Surface:
     Parameters
     ----------
     triangles_world : (T, 3, 3) float64
-        Corners in metres; none without area.
+        Corners in metres. Those without area are the lines or points that they are.
     """
 
     def __init__(self, triangles_world: Floats) -> None:
@@ -62,9 +69,12 @@ class Surface:
         self._reach = np.linalg.norm(triangles_world - self._middle[:, None], axis=2).max(axis=1)
         self._edges = np.roll(triangles_world, -1, axis=1) - triangles_world  # (T, 3, 3)
         self._lengths2 = (self._edges**2).sum(axis=2)
-        normal = np.cross(self._edges[:, 0], self._edges[:, 1])
-        self._normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        self._outwards = np.cross(self._edges, self._normal[:, None])  # in the plane, (T, 3, 3)
+        # Directions first: the product of two edges may be less than a float can say.
+        _, along = lengths_and_units(self._edges.reshape(-1, 3))
+        along = along.reshape(-1, 3, 3)
+        across, self._normal = lengths_and_units(np.cross(along[:, 0], along[:, 1]))
+        self._is_line = across < _SINE_OF_A_LINE
+        self._outwards = np.cross(along, self._normal[:, None])  # in the plane, (T, 3, 3)
 
     def shifted(self, by_world: Floats) -> "Surface":
         """Return the surface moved by (3,) metres."""
@@ -86,8 +96,10 @@ class Surface:
         height = np.einsum("pi,pi->p", offsets[:, 0], normal)
         beyond = np.einsum("pki,pki->pk", offsets, self._outwards[triangles]) > 0
         place = points - height[:, None] * normal
-        off = np.flatnonzero(beyond.any(axis=1))
-        along = np.einsum("pki,pki->pk", offsets[off], edges[off]) / self._lengths2[triangles[off]]
+        off = np.flatnonzero(beyond.any(axis=1) | self._is_line[triangles])
+        lengths2 = self._lengths2[triangles[off]]
+        along = np.einsum("pki,pki->pk", offsets[off], edges[off])
+        along /= np.where(lengths2 > 0, lengths2, 1.0)
         rest = offsets[off] - np.clip(along, 0.0, 1.0)[..., None] * edges[off]  # (P', 3, 3)
         nearest = (rest**2).sum(axis=2).argmin(axis=1)
         place[off] = points[off] - rest[np.arange(len(off)), nearest]
@@ -127,7 +139,7 @@ class TrueHull:
     cameras : sequence of Camera
         At least one; none of them in a shape.
     shapes : sequence of Shape
-        The real things.
+        The real things; none is flat, for a hull without an inside is never found.
     world_from_shape : sequence of (3, 4) float64
         Where each stands.
     """
@@ -218,15 +230,16 @@ class TrueHull:
         may = []
         for camera in self._cameras:
             rays = centers_world - camera.center_world
-            away = np.linalg.norm(rays, axis=1)
+            away, directions = lengths_and_units(rays)
             toward = middles - camera.center_world
-            depth = (rays / away[:, None]) @ toward.T  # (N, S)
-            far2 = (toward**2).sum(axis=1)
-            angle = np.arctan2(np.sqrt(np.maximum(far2 - depth**2, 0.0)), depth)
-            # Half the angles that the ball and the cell take up; all of it for whoever is in them.
-            ball = np.arcsin(np.minimum(self._reach_m / np.sqrt(far2), 1.0))
-            cell = np.arcsin(np.minimum(radius_m / away, 1.0))
-            may.append(angle <= ball + cell[:, None] + _ROUNDING_RAD)
+            depth = directions @ toward.T  # (N, S)
+            far, _ = lengths_and_units(toward)
+            angle = np.arctan2(np.sqrt(np.maximum(far**2 - depth**2, 0.0)), depth)
+            # Half the angles that the ball and the cell take up; all for a camera that is in them.
+            ball = np.arcsin(_share(self._reach_m, far))
+            cell = np.arcsin(_share(radius_m, away))
+            close = angle <= ball + cell[:, None] + _ROUNDING_RAD
+            may.append(close | (away <= radius_m)[:, None] | (far <= self._reach_m))
         return may
 
     def _may_hold(
@@ -237,17 +250,18 @@ class TrueHull:
         for camera, shapes in zip(self._cameras, may, strict=True):
             keep &= _in_image(camera, centers_world, radius_m)
             rays = centers_world - camera.center_world
-            away = np.linalg.norm(rays, axis=1)
+            away, directions = lengths_and_units(rays)
             # One shape that may be met is enough to keep a cell: those that most may meet first.
-            undecided = keep.copy()
+            # Rays through a cell that holds the camera go anywhere.
+            undecided = keep & (away > radius_m)
             for number in np.argsort(-shapes[keep].sum(axis=0), kind="stable"):
                 rows = np.flatnonzero(undecided & shapes[:, number])
                 if len(rows):
                     pose = self._shape_from_world[number]
                     origin = transform(pose, camera.center_world[None])[0]
-                    directions = (rays[rows] / away[rows, None]) @ pose[:, :3].T
+                    local = directions[rows] @ pose[:, :3].T
                     slack = radius_m / away[rows]
-                    meets = _may_meet(self._shapes[number], origin, directions, slack)
+                    meets = _may_meet(self._shapes[number], origin, local, slack)
                     shapes[rows[~meets], number] = False
                     undecided[rows[meets]] = False
             keep &= ~undecided
@@ -362,13 +376,20 @@ def _may_meet(shape: Shape, origin: Floats, directions: Floats, slack: Floats) -
 def _in_image(camera: Camera, points_world: Floats, radius_m: float) -> NDArray[np.bool_]:
     """Tell which balls (N) about points (N, 3) may show in a camera's image."""
     points_cam = transform(camera.cam_from_world, points_world)
-    ahead = points_cam[:, 2] > radius_m
+    away, _ = lengths_and_units(points_cam)
+    ahead = points_cam[:, 2] - radius_m > _IN_SIGHT * away
     pixels = img_from_cam(camera, np.where(ahead[:, None], points_cam, [0.0, 0.0, 1.0]))
     # A point within the radius changes x / z by at most this.
     nearest_m = np.where(ahead, points_cam[:, 2] - radius_m, 1.0)
-    steep = np.linalg.norm(points_cam, axis=1) / np.where(ahead, points_cam[:, 2], 1.0)
+    steep = away / np.where(ahead, points_cam[:, 2], 1.0)
     slack_px = _STEEPEST_LENS * camera.params[:2].max() * steep * radius_m / nearest_m
     size = np.array([camera.width_px, camera.height_px])
     in_image = ((pixels >= -slack_px[:, None]) & (pixels < size + slack_px[:, None])).all(axis=1)
     behind = points_cam[:, 2] <= -radius_m if radius_m else ~ahead
     return np.where(ahead, in_image, ~behind)
+
+
+def _share(radius_m: Floats | float, away_m: Floats) -> Floats:
+    """Return the sine of half the angle that balls take up; 1 for those that hold the camera."""
+    apart = away_m > radius_m
+    return np.asarray(np.where(apart, radius_m / np.where(apart, away_m, 1.0), 1.0))

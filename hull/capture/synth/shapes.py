@@ -2,9 +2,11 @@
 
 Each shape lies in a frame of its own, centred on the origin, in metres. The signed distance of a
 convex shape is a convex function of the point, negative inside, and changes by at most one metre a
-metre; `closest.py` rests on both.
+metre; `closest.py` rests on both. A size may be zero, and a coordinate or a direction as small as a
+float can be.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +19,16 @@ _SPHERE_POINTS = 400
 
 #: Points on each rim of a cylinder; the polygon falls short by 0.05 % of the radius.
 _RIM_POINTS = 100
+
+#: Below this length the squares of a vector's coordinates lose digits, or vanish.
+_SQUARES_LOSE_DIGITS = 1e-140
+
+#: Directions shorter than this are brought to length 1 before they are compared with 1e-12.
+_SHORT = 0.1
+
+#: A ray that leaves an axis by less than the root of this in a length runs along it: it would take
+#: 1e140 lengths to leave any shape, and the square of less has lost its digits.
+_ALONG_AXIS2 = 1e-280
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +59,9 @@ class Ball:
 
     def hit(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         """Return where rays enter, (N,) in lengths of `directions`; inf where they miss."""
+        return _first_entry(self._enter, origin, directions)
+
+    def _enter(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         return _enter_ball(origin, directions, self.radius_m)
 
     def outline(self) -> Points:
@@ -87,12 +102,15 @@ class Capsule:
 
     def hit(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         """Return where rays enter, (N,) in lengths of `directions`; inf where they miss."""
+        return _first_entry(self._enter, origin, directions)
+
+    def _enter(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         # The shape is a cylinder and two balls: the first of the three entries is the entry.
         a = (directions[:, :2] ** 2).sum(axis=1)
         b = directions[:, :2] @ origin[:2]
         c = origin[:2] @ origin[:2] - self.radius_m**2
         root = b * b - a * c
-        meets = (root >= 0) & (a > 0)
+        meets = (root >= 0) & (a > _ALONG_AXIS2)
         along = np.full(len(directions), np.inf)
         along[meets] = (-b[meets] - np.sqrt(root[meets])) / a[meets]
         height = np.full(len(directions), np.inf)
@@ -141,17 +159,20 @@ class Box:
         signs = np.where(points < 0, -1.0, 1.0)
         beyond = np.abs(points) - np.array(self.sizes_m)  # (N, 3) past each pair of faces
         outside = np.maximum(beyond, 0.0)
-        distance = np.linalg.norm(outside, axis=1)
+        distance, away = lengths_and_units(outside)
         face = beyond.argmax(axis=1)
         slope = np.zeros_like(points)
         rows = np.arange(len(points))
         slope[rows, face] = signs[rows, face]
         is_outside = distance > 0
-        slope[is_outside] = signs[is_outside] * outside[is_outside] / distance[is_outside, None]
+        slope[is_outside] = signs[is_outside] * away[is_outside]
         return np.where(is_outside, distance, beyond[rows, face]), slope
 
     def hit(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         """Return where rays enter, (N,) in lengths of `directions`; inf where they miss."""
+        return _first_entry(self._enter, origin, directions)
+
+    def _enter(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         # A direction across a pair of faces never meets them; a tiny slope says so without a case.
         steep = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
         half = np.array(self.sizes_m)
@@ -196,32 +217,32 @@ class Cylinder:
 
         Inside, the distance is that to the nearer of the mantle and the ends.
         """
-        across = np.hypot(points[:, 0], points[:, 1])
+        across, outwards = lengths_and_units(points[:, :2])  # on the axis none: a subgradient
         past_mantle = across - self.radius_m
         past_end = np.abs(points[:, 2]) - self.half_length_m
         mantle, end = np.maximum(past_mantle, 0.0), np.maximum(past_end, 0.0)
-        outside = np.hypot(mantle, end)
+        outside, away = lengths_and_units(np.column_stack([mantle, end]))
         is_outside = outside > 0
-        share = np.where(is_outside, outside, 1.0)
         to_mantle = past_mantle > past_end
-        # On the axis nothing grows outwards: zero is a subgradient there.
-        outwards = np.where(is_outside, mantle / share, to_mantle) / np.where(across > 0, across, 1)
         slope = np.zeros_like(points)
-        slope[:, :2] = outwards[:, None] * points[:, :2]
-        slope[:, 2] = np.where(is_outside, end / share, ~to_mantle) * np.where(
+        slope[:, :2] = np.where(is_outside, away[:, 0], to_mantle)[:, None] * outwards
+        slope[:, 2] = np.where(is_outside, away[:, 1], ~to_mantle) * np.where(
             points[:, 2] < 0, -1.0, 1.0
         )
         return np.where(is_outside, outside, np.maximum(past_mantle, past_end)), slope
 
     def hit(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         """Return where rays enter, (N,) in lengths of `directions`; inf where they miss."""
+        return _first_entry(self._enter, origin, directions)
+
+    def _enter(self, origin: Points, directions: Points) -> NDArray[np.float64]:
         # A ray is in the shape while it is both within the endless mantle and between the ends.
         a = (directions[:, :2] ** 2).sum(axis=1)
         b = directions[:, :2] @ origin[:2]
         c = origin[:2] @ origin[:2] - self.radius_m**2
         enters = np.full(len(directions), -np.inf if c <= 0 else np.inf)  # along the axis
         leaves = np.full(len(directions), np.inf)
-        slanted = a > 0
+        slanted = a > _ALONG_AXIS2
         root = b * b - a * c
         meets = slanted & (root >= 0)
         half = np.sqrt(root[meets])
@@ -265,11 +286,50 @@ def sphere_points(count: int = _SPHERE_POINTS) -> Points:
 
 def _distance_from(offsets: Points, radius_m: float) -> tuple[NDArray[np.float64], Points]:
     """Return the distances to a ball about the origin of `offsets`, and their slopes."""
-    length = np.linalg.norm(offsets, axis=1)
-    slope = np.zeros_like(offsets)  # at the centre nothing grows: zero is a subgradient there
-    away = length > 0
-    slope[away] = offsets[away] / length[away, None]
+    length, slope = lengths_and_units(offsets)  # at the centre none: zero is a subgradient there
     return length - radius_m, slope
+
+
+def lengths_and_units(vectors: Points) -> tuple[NDArray[np.float64], Points]:
+    """Return the lengths (N,) of vectors (N, K) and the unit vectors (N, K) along them.
+
+    Both are right to rounding however short a vector is; that along no vector at all is zero.
+    """
+    lengths = np.linalg.norm(vectors, axis=1)
+    units = np.zeros_like(vectors)
+    plain = lengths > _SQUARES_LOSE_DIGITS
+    units[plain] = vectors[plain] / lengths[plain, None]
+    if not plain.all():
+        tiny = np.flatnonzero(~plain & vectors.any(axis=1))
+        longest = np.abs(vectors[tiny]).max(axis=1)
+        scaled = vectors[tiny] / longest[:, None]
+        of_scaled = np.linalg.norm(scaled, axis=1)
+        lengths[tiny] = of_scaled * longest
+        units[tiny] = scaled / of_scaled[:, None]
+    return lengths, units
+
+
+def _first_entry(
+    enter: Callable[[Points, Points], NDArray[np.float64]], origin: Points, directions: Points
+) -> NDArray[np.float64]:
+    """Return where rays enter, found by a function that takes no short directions.
+
+    A ray without a direction enters nothing.
+    """
+    short = np.flatnonzero((directions**2).sum(axis=1) < _SHORT**2)
+    if not len(short):
+        return enter(origin, directions)
+    lengths, units = lengths_and_units(directions[short])
+    units[lengths == 0] = [0.0, 0.0, 1.0]
+    longer = directions.copy()
+    longer[short] = units
+    along = enter(origin, longer)
+    with np.errstate(over="ignore", divide="ignore"):
+        in_lengths = along[short] / lengths
+    # Farther than a float can say is still not a miss.
+    met = np.isfinite(along[short]) & (lengths > 0)
+    along[short] = np.where(met, np.minimum(in_lengths, np.finfo(np.float64).max), np.inf)
+    return along
 
 
 def _enter_ball(origin: Points, directions: Points, radius_m: float) -> NDArray[np.float64]:
