@@ -17,7 +17,7 @@ it may, in whatever direction.
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.predicates import within_range
+from hybridve.hull.contact.predicates import LEAST, within_range
 from hybridve.hull.contact.surface_tree import (
     DISTANCE_ERROR,
     are_in_solid,
@@ -68,7 +68,8 @@ class SurfaceDistance:
     ) -> None:
         self.is_closed = is_closed
         self.apart_m = 0.0
-        corners = solid = within_range(vertices[faces])  # (T, 3, 3)
+        corners = np.asarray(vertices[faces], np.float64)  # (T, 3, 3)
+        solid = within_range(corners)
         if is_closed:
             if solid_faces is None:
                 solid_faces = meeting_faces(vertices, faces)
@@ -93,7 +94,8 @@ class SurfaceDistance:
 
     def error_m(self, distance_m: float) -> float:
         """Return what a distance up to `distance_m` may be off by, by rounding."""
-        return DISTANCE_ERROR * (distance_m + self._tree.longest_m)
+        # Squares of what is below 2^-300 m may underflow.
+        return DISTANCE_ERROR * (distance_m + self._tree.longest_m) + LEAST
 
     def signed(
         self, points: NDArray[np.float64]

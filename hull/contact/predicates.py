@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hybridve.hull.jit import compiled, inlined
 
 #: Smaller coordinates count as 0, so that no part of a product of three underflows.
-_LEAST = 2.0**-300
+LEAST = 2.0**-300
 
 #: The largest coordinate that a product of three, and what splits it, can be made of.
 MOST = 2.0**300
@@ -46,7 +46,7 @@ def within_range(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     if not (np.abs(points) <= MOST).all():
         raise ValueError(f"found {np.abs(points).max()} among coordinates, expected at most {MOST}")
-    return np.where(np.abs(points) < _LEAST, 0.0, points)
+    return np.where(np.abs(points) < LEAST, 0.0, points)
 
 
 @inlined

@@ -42,7 +42,7 @@ _MOST_DEPTH = 64
 #: What a distance may be off by, in shares of it and the triangle's longest edge together.
 DISTANCE_ERROR = 2.0**-46
 
-#: A frame across an edge is kept if this much of it is left when made orthogonal once more.
+#: A direction across an edge is kept if this much of it is left when made orthogonal once more.
 _STEADY = 0.5
 
 
@@ -92,8 +92,7 @@ def make_tree(corners: NDArray[np.float64], solid: NDArray[np.float64]) -> Surfa
     both = np.concatenate([corners, solid], axis=1)
     lower, upper = both.min(axis=1), both.max(axis=1)
     box, child, first, count, number = _build(lower, upper)
-    frame = np.zeros((len(corners), 12))
-    _make_frames(np.ascontiguousarray(corners[number]), frame)
+    frame = _frames(corners[number])
     return SurfaceTree(
         box,
         child,
@@ -191,44 +190,41 @@ def _build(
     )
 
 
-@compiled
-def _make_frames(corners: NDArray[np.float64], frame: NDArray[np.float64]) -> None:
-    """Write the frames (T, 12) of triangles (T, 3, 3)."""
-    u, m, f = np.zeros(3), np.zeros(3), np.zeros(3)
-    for t in range(len(corners)):
-        start, length = 0, -1.0
-        for k in range(3):
-            edge = corners[t, (k + 1) % 3] - corners[t, k]
-            long = np.sqrt((edge * edge).sum())
-            if long > length:
-                start, length = k, long
-        a, b, c = corners[t, start], corners[t, (start + 1) % 3], corners[t, (start + 2) % 3]
-        u[:], f[:] = b - a, c - a
-        if length > 0.0:
-            u /= length
-        else:
-            u[0], u[1], u[2] = 1.0, 0.0, 0.0
-        x = (f * u).sum()
-        m[:] = f - x * u
-        h = np.sqrt((m * m).sum())
-        kept = 0.0
-        if h > 0.0:
-            m /= h
-            m -= (m * u).sum() * u
-            kept = np.sqrt((m * m).sum())
-        if kept < _STEADY:  # as thin as rounding: any direction across does
-            least = 0
-            for axis in range(1, 3):
-                if abs(u[axis]) < abs(u[least]):
-                    least = axis
-            m[:] = 0.0
-            m[least] = 1.0
-            m -= (m * u).sum() * u
-            kept = np.sqrt((m * m).sum())
-        m /= kept
-        m -= (m * u).sum() * u
-        frame[t, 0:3], frame[t, 3:6], frame[t, 6:9] = a, u, m
-        frame[t, 9], frame[t, 10], frame[t, 11] = length, x, max((f * m).sum(), 0.0)
+def _frames(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the frames (T, 12) of triangles (T, 3, 3)."""
+    rows = np.arange(len(corners))
+    edges = np.roll(corners, -1, axis=1) - corners
+    lengths = np.linalg.norm(edges, axis=2)
+    start = lengths.argmax(axis=1)
+    length = lengths[rows, start]
+    first = corners[rows, start]
+    third = corners[rows, (start + 2) % 3] - first
+    along = np.where(length[:, None] > 0, edges[rows, start], np.eye(3)[0])
+    along /= np.where(length > 0, length, 1.0)[:, None]
+    apex = np.einsum("ij,ij->i", third, along)
+    across, height = _across(third - apex[:, None] * along, along)
+    # Of a triangle as thin as rounding, any direction across does.
+    is_lost = ~(height > 0)
+    axis = np.eye(3)[np.abs(along[is_lost]).argmin(axis=1)]
+    across[is_lost] = _across(axis, along[is_lost])[0]
+    across, _ = _across(across, along)
+    height = np.maximum(np.einsum("ij,ij->i", third, across), 0.0)
+    return np.column_stack([first, along, across, length, apex, height])
+
+
+def _across(
+    vectors: NDArray[np.float64], along: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return vectors (T, 3) made unit vectors at right angles to others, and how long they were.
+
+    0 where less than half of one was at right angles, so that rounding may be what is left.
+    """
+    length = np.linalg.norm(vectors, axis=1)
+    units = vectors / np.where(length > 0, length, 1.0)[:, None]
+    units -= np.einsum("ij,ij->i", units, along)[:, None] * along
+    kept = np.linalg.norm(units, axis=1)
+    units /= np.where(kept > 0, kept, 1.0)[:, None]
+    return units, np.where(kept >= _STEADY, length, 0.0)
 
 
 @inlined
@@ -251,8 +247,9 @@ def _in_triangle(
     if y <= 0.0:
         return min(max(x, 0.0), length), 0.0
     back_x = apex_x - length
-    is_left = apex_x * y - apex_y * x > 0.0
-    is_right = back_x * y - apex_y * (x - length) < 0.0
+    # On a line counts as beyond it: of a triangle that is a line or a point, all is.
+    is_left = apex_x * y - apex_y * x >= 0.0
+    is_right = back_x * y - apex_y * (x - length) <= 0.0
     if is_left:
         along = _on_edge(x, y, apex_x, apex_y)
         left_x, left_y = along * apex_x, along * apex_y
@@ -361,7 +358,7 @@ def closest_on_surface(
     return distance_m, nearest, triangle
 
 
-@inlined
+@compiled
 def _turn(a: NDArray[np.float64], b: NDArray[np.float64], p: NDArray[np.float64]) -> int:
     """Return on which side of the way from a to b, seen along x, p + (0, e, e^2) lies.
 
