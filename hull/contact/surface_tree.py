@@ -55,7 +55,7 @@ class SurfaceTree(NamedTuple):
         Lower and upper corner of all that is below a node, metres.
     child : (N,) int64
         The first of its two children, which stand side by side; -1 for a leaf.
-    first, count : (N,) int64
+    first, n_triangles : (N,) int64
         The triangles of a leaf.
     number : (T,) int64
         Which triangle of the mesh each is.
@@ -72,7 +72,7 @@ class SurfaceTree(NamedTuple):
     box: NDArray[np.float64]
     child: NDArray[np.int64]
     first: NDArray[np.int64]
-    count: NDArray[np.int64]
+    n_triangles: NDArray[np.int64]
     number: NDArray[np.int64]
     frame: NDArray[np.float64]
     solid: NDArray[np.float64]
@@ -292,13 +292,14 @@ def _squared_to_box(
     x = max(box[node, 0] - p_x, 0.0, p_x - box[node, 3])
     y = max(box[node, 1] - p_y, 0.0, p_y - box[node, 4])
     z = max(box[node, 2] - p_z, 0.0, p_z - box[node, 5])
-    return x * x + y * y + z * z
+    squared: float = x * x + y * y + z * z
+    return squared
 
 
 @inlined
 def _reach(squared: float, longest_m: float) -> float:
     """Return the squared distance of boxes up to which a triangle may still be found as near."""
-    distance_m = np.sqrt(squared)
+    distance_m: float = np.sqrt(squared)
     distance_m += 2.0 * DISTANCE_ERROR * (distance_m + longest_m)
     return distance_m * distance_m
 
@@ -315,7 +316,7 @@ def closest_on_surface(
     n = len(points)
     distance_m, nearest, triangle = np.zeros(n), np.zeros((n, 3)), np.zeros(n, np.int64)
     waiting, waiting_squared = np.zeros(_MOST_DEPTH, np.int64), np.zeros(_MOST_DEPTH)
-    box, child, first, count = tree.box, tree.child, tree.first, tree.count
+    box, child, first, count = tree.box, tree.child, tree.first, tree.n_triangles
     number, frame, longest_m = tree.number, tree.frame, tree.longest_m
     best = ZERO
     for i in range(n):
@@ -401,7 +402,7 @@ def _times_crossed(p: NDArray[np.float64], solid: NDArray[np.float64], t: int, t
 @inlined
 def _winding(p: NDArray[np.float64], tree: SurfaceTree, waiting: NDArray[np.int64]) -> int:
     """Return how often the solid's surface goes round a point; `waiting` is room for a stack."""
-    box, child, first, count = tree.box, tree.child, tree.first, tree.count
+    box, child, first, count = tree.box, tree.child, tree.first, tree.n_triangles
     for axis in range(3):
         if p[axis] < box[0, axis] or p[axis] > box[0, 3 + axis]:
             return 0
