@@ -15,6 +15,7 @@ from hybridve.hull.contact.mesh import read_cad
 from hybridve.hull.contact.part import join_meshes
 from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.contact.topology import meeting_faces
+from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import make_hull
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
@@ -117,6 +118,41 @@ def test_what_meets_in_the_file_meets_wherever_the_part_stands(turn: bool) -> No
         SurfaceDistance(corners[:-3] + 1e-6 * corners[:-3] ** 2, faces[:-2], is_closed=True)
 
 
+def test_bounds_hold_for_the_solid_whose_corners_meet() -> None:
+    """A box 300 m from its file's origin, in single precision: its corners are 50 um apart."""
+    rng = np.random.default_rng(3)
+    offset = np.array([300.0, -300.0, 300.0])
+    vertices, faces = box(0.15)
+    corners = vertices[faces].reshape(-1, 3) + offset
+    corners += rng.choice([0.0, 0.9 * 2.0**-15], corners.shape)
+    faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    solid_faces = meeting_faces(corners, faces)
+    assert solid_faces is not None
+    corners -= offset
+    views = ring_views(6)
+    meter = ClearanceMeter(
+        corners, faces, is_closed=True, solid_faces=solid_faces, tolerance_m=1e-6
+    )
+    solid = SurfaceDistance(corners, solid_faces, is_closed=True)
+    assert 1e-5 < meter.error_m < 1e-4
+    n_asked = 0
+    for x in (0.2, 0.22, 0.3):
+        center = np.array([x, 0.03, 0.02])
+        hull = make_hull(views, ball_masks(views, center, 0.06))
+
+        found = meter.measure(hull)
+
+        near, far = found.signed_m
+        assert near <= solid.signed(found.on_hull_world[None])[0][0] <= far
+        points = found.on_hull_world + 10.0 ** rng.uniform(-6, -2, (4000, 1)) * rng.normal(
+            size=(4000, 3)
+        )
+        points = points[contains_points(hull, points)]
+        assert solid.signed(points)[0].min() >= near
+        n_asked += len(points)
+    assert n_asked > 2000
+
+
 def test_two_solids_in_one_file_are_solid_where_they_overlap(tmp_path: Path) -> None:
     """A bar along x and one along y, 20 mm higher; a ball of 30 mm in both: 90 mm deep, not free.
 
@@ -196,6 +232,36 @@ def test_real_parts_have_the_sides_that_solid_angles_have(recordings: Path) -> N
     assert n_parts > 25
     assert n_points > 5000
     assert n_inside > 1000
+
+
+@pytest.mark.recording
+@pytest.mark.parametrize("name", ["ur5/ur5_wrist3.stl", "parts/box.STL", "prusa/x-carriage.stl"])
+def test_a_hull_wholly_inside_a_part_is_in_it(recordings: Path, name: str) -> None:
+    """A ball in the middle of the material, where its sides have most room."""
+    (part,) = read_cad(recordings / "meshes" / name).parts
+    rng = np.random.default_rng(4)
+    views = ring_views(6)
+    vertices = part.vertices - part.vertices.mean(axis=0)
+    vertices *= 2.0 / np.ptp(vertices, axis=0).max()
+    surface = SurfaceDistance(vertices, part.faces, is_closed=True)
+    points = rng.uniform(vertices.min(axis=0), vertices.max(axis=0), (5000, 3))
+    signed_m, _ = surface.signed(points)
+    n_measured = 0
+    for deepest in np.argsort(signed_m)[:4]:
+        depth_m = -signed_m[deepest]
+        assert surface.winding(points[deepest][None]) == 1
+        meter = ClearanceMeter(vertices - points[deepest], part.faces, is_closed=True)
+        hull = make_hull(views, ball_masks(views, np.zeros(3), 0.3 * depth_m))
+        if not contains_points(hull, np.zeros((1, 3)))[0]:
+            continue  # the ball is smaller than a pixel
+
+        found = meter.measure(hull)
+
+        assert (found.lower_m, found.upper_m) == (0, 0)
+        assert found.depth_upper_m >= depth_m
+        assert found.depth_lower_m > 0.9 * depth_m
+        n_measured += 1
+    assert n_measured > 0
 
 
 @pytest.mark.recording

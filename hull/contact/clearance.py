@@ -128,6 +128,14 @@ class ClearanceMeter:
     ValueError
         If the tolerance is not above 0, there is no triangle, or a surface that is said to be
         closed is not.
+
+    Attributes
+    ----------
+    is_closed, tolerance_m
+        As given.
+    error_m : float
+        What a distance within reach may be off by, metres: rounding, some 1e-12, and how far
+        corners that meet are apart, if they are. The bounds of `measure` allow for it.
     """
 
     def __init__(
@@ -158,7 +166,14 @@ class ClearanceMeter:
         exponent = int(np.ceil(np.log2(max(_NEAR_M, _REACH_SIZES * size_m))))
         self._roots_m = [2.0 ** (exponent + more) for more in (0, 2, 4)]
         self._lattice = DistanceLattice(self._surface, self._roots_m[-1])
-        self._error_m = self._surface.error_m(_FARTHEST * self._roots_m[-1])
+        self._rounding_m = self._surface.error_m(_FARTHEST * self._roots_m[-1])
+        # Distances are to the triangles; the surface that decides about inside may be `apart_m`
+        # from them.
+        self.error_m = (
+            self._surface.apart_m
+            + self._rounding_m
+            + _ROUNDOFF * (self._roots_m[-1] + float(np.abs(self._origin_world).max()))
+        )
 
     def closest(
         self, points_world: NDArray[np.float64]
@@ -171,7 +186,10 @@ class ClearanceMeter:
         return distance_m, nearest + self._origin_world, triangle
 
     def signed_distance(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distances (N,) of points (N, 3), metres, negative inside a closed object."""
+        """Return the distances (N,) of points (N, 3), metres, negative inside a closed object.
+
+        Within reach they are right to `error_m`.
+        """
         return self._surface.signed(points_world - self._origin_world)[0]
 
     def measure(
@@ -212,10 +230,7 @@ class ClearanceMeter:
         if best.distance_m[0] < np.inf:  # the exact distance of the best point
             signed_m, nearest = self._surface.signed(best.point[None])
             upper_m, on_object = float(signed_m[0]), nearest[0]
-        # Distances are to the triangles, and rounded; the solid's surface may be `apart_m` from
-        # them. Its inside is exact: a point in it is in it, however near to the surface.
-        error_m = self._surface.apart_m + self._error_m
-        error_m += _ROUNDOFF * (root_m + float(np.abs(origin_world).max()))
+        error_m = self.error_m + _ROUNDOFF * float(np.abs(shift_world).max())
         least_m = min(lowest_m, upper_m, beyond_m) - error_m
         if upper_m > error_m:
             upper_m += error_m
@@ -264,7 +279,7 @@ class ClearanceMeter:
                 cubes,
                 self._lattice.distance_m,
                 self._lattice.nearest,
-                self._error_m,
+                self._rounding_m,
                 asked,
                 best,
             )

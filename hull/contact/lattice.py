@@ -18,7 +18,9 @@ is taken off before the root is drawn, as near the surface little d^2 is much d.
 
 Both are off by no more than some H^2 / d for a cube with edge 2 H, where bounds from a metre a
 metre are off by H: once a cube's corners are known, cells far smaller need no distance of their
-own. A cube that the surface does not meet lies on one side of it, that of its corners.
+own. A cube that the surface does not meet lies on one side of it, that of its corners. It is not
+met if all corners are farther from the surface than from the cube's centre: a point in the cube,
+and any up to 2 H from the centre, is nearer to some corner than that.
 """
 
 from typing import NamedTuple
@@ -144,6 +146,7 @@ class DistanceLattice:
             self.distance_m,
             self.nearest,
             self._surface.is_closed,
+            self._surface.apart_m,
             fine_m,
         )
         return Cubes(center, np.full(len(center), half_m), corner, side, is_fine)
@@ -241,9 +244,13 @@ def _judge(
     distance_m: NDArray[np.float64],
     nearest: NDArray[np.float64],
     is_closed: bool,
+    apart_m: float,
     fine_m: float,
 ) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-    """Return on which side of the surface cubes lie, and which have bounds that are close."""
+    """Return on which side of the surface cubes lie, and which have bounds that are close.
+
+    The solid's surface, whose side is asked for, may be `apart_m` from that of the distances.
+    """
     side, is_fine = np.zeros(len(center), np.int8), np.zeros(len(center), np.bool_)
     for i in range(len(center)):
         smallest, mean, largest_m, above = np.inf, 0.0, 0.0, np.inf
@@ -258,9 +265,10 @@ def _judge(
                 squared += (center[i, axis] - nearest[corner[i, k], axis]) ** 2
             above = min(above, squared)
         diagonal = 3.0 * half_m * half_m
+        unmet_m = np.sqrt(diagonal) + apart_m
         if not is_closed:
             side[i] = _OUTSIDE
-        elif smallest > diagonal:  # the surface does not meet the cube
+        elif smallest > unmet_m * unmet_m:  # the surface does not meet the cube
             side[i] = _OUTSIDE if largest_m > 0 else _INSIDE
         else:
             side[i] = _ACROSS
