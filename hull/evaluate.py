@@ -315,6 +315,7 @@ class _Tools:
                     part.vertices_world,
                     part.faces,
                     is_closed=part.is_closed,
+                    solid_faces=part.solid_faces,
                     tolerance_m=settings.clearance_m,
                 )
                 for part in chain.scene.objects

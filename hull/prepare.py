@@ -69,6 +69,7 @@ def _run_kernels() -> None:
     meter = ClearanceMeter(mesh.vertices_world, mesh.faces, is_closed=False)
     for shift_world in (np.zeros(3), np.array([3.0, 0.0, 1.0])):  # touched, and far beside
         meter.measure(hull, shift_world)
+    ClearanceMeter(*_tetrahedron(), is_closed=True).measure(hull)
     spans_in_hull(hull, np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0)
     connected_volumes(hull)
 
@@ -84,6 +85,12 @@ def _mask() -> NDArray[np.uint8]:
     mask = np.zeros((_SIDE_PX, _SIDE_PX), np.uint8)
     mask[16:48, 16:48] = 1
     return mask
+
+
+def _tetrahedron() -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Return the smallest solid there is, which has an inside."""
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
+    return np.eye(4, 3, dtype=np.float64), faces
 
 
 def _sheet() -> Body:

@@ -101,6 +101,7 @@ class Layout:
                 one.vertices_world,
                 one.faces,
                 is_closed=one.is_closed,
+                solid_faces=one.solid_faces,
                 tolerance_m=METER_SHARE * move.tolerance_m,
             )
             return MovedObject(meter, required_m)

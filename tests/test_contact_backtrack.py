@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.contact.backtrack import (
     FirstContact,
+    _patch,
     approach_speed,
     first_contact,
     interpolate_masks,
@@ -329,6 +330,20 @@ def test_the_point_lies_amid_the_patch_of_first_contact(
     assert np.linalg.norm(found.point_world - patch.mean(axis=0)) < 0.5 * size_m
     radius_m = np.linalg.norm(found.point_world - [0.0, 0.0, -0.25])
     assert 0.0995 < radius_m < 0.1 + 1e-12  # on a triangle of the sphere
+
+
+def test_a_triangle_as_thin_as_rounding_gives_no_samples() -> None:
+    """Its normal is not quite nothing, but what it says is across it is not."""
+    sliver = np.array([[0.2, 0.3, 0.2], [0.0, 0.1, -0.3], [0.1, 0.2, -0.04999999999999999]])
+    assert np.linalg.norm(np.cross(sliver[1] - sliver[0], sliver[2] - sliver[0])) > 0
+    hull = ball(0.0, 0.0, 0.5)
+
+    alone, _ = _patch(hull, sliver[None], sliver[2], 0.1)
+    wide = sliver + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    beside, _ = _patch(hull, np.stack([sliver, wide]), sliver[2], 0.1)
+
+    assert len(alone) == 0
+    assert len(beside) > 0
 
 
 def test_the_result_is_the_same_to_the_bit_on_any_number_of_threads_and_after_any_frame(

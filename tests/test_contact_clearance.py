@@ -290,6 +290,7 @@ def test_bounds_of_cells_hold_at_every_point_of_them(is_closed: bool) -> None:
                 cubes,
                 lattice.distance_m,
                 lattice.nearest,
+                surface.error_m(16.0),
                 asked,
                 Best(np.full(1, np.inf), np.full(3, np.nan)),
             )

@@ -854,6 +854,8 @@ def _patch(
             continue  # no area: nothing to be amid
         axis_u = edge / length
         axis_v = np.cross(normal / area, axis_u)
+        if not other @ axis_v > 0:
+            continue  # as thin as rounding: no direction is across it
         foot = center_world - ((center_world - a) @ normal / area) * normal / area
         points = foot + reach_m * (across[:, None] * axis_u + along[:, None] * axis_v)
         # Weights of b and c: within the triangle where both are at least 0 and add up to 1 or less.

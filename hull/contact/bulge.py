@@ -74,7 +74,7 @@ def real_upper(hull: Hull, grown_hull: Hull, meter: ClearanceMeter, clearance: C
         if promise.at_least_m >= bound_m:
             break
         bound_m = min(bound_m, farthest_on(meter, promise.ray, bound_m))
-    return max(bound_m, clearance.lower_m)
+    return max(bound_m + meter.error_m, clearance.lower_m)
 
 
 class Ray(NamedTuple):

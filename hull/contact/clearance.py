@@ -62,8 +62,12 @@ _FEW_CELLS = 100
 #: Halvings of the root at most; cubes are never as small before they are small enough.
 _MOST_LEVELS = 64
 
-#: What rounding in double precision may add to a distance, in lengths of the reach.
+#: What rounding takes from a bound besides the error of the distances: of a root's cubes, and of
+#: points on the way to the world's frame, in lengths of the root and of the way to its origin.
 _ROUNDOFF = 64.0 * 2.0**-53
+
+#: No corner of a root is farther from the object than so many of its half edges.
+_FARTHEST = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,8 +78,9 @@ class Clearance:
     ----------
     lower_m, upper_m : float
         Bounds of the distance between the hull and the surface, or the solid it bounds: both 0
-        where a point of the hull lies on or in it; the upper one inf where no hull was found, and
-        the lower one how far was looked.
+        where a point of the hull lies on or in it (on it as far as rounding can tell, which is
+        some 1e-12 m); the upper one inf where no hull was found, and the lower one how far was
+        looked.
     on_object_world, on_hull_world : (3,) float64
         The two points that the upper bound was measured between, metres; of a hull that reaches
         into a closed object its deepest point, and the point of the surface nearest to that. NaN
@@ -161,7 +166,7 @@ class NearCells:
         """
         best = Best(np.full(1, np.inf), np.full(3, np.nan))
         lowest_m = self._meter._refine(self._level.only(kept), best, self._asked)
-        return self._meter._found(best, lowest_m, self._level.half_m, np.zeros(3))
+        return self._meter._found(best, lowest_m, np.zeros(3))
 
 
 class ClearanceMeter:
@@ -177,11 +182,22 @@ class ClearanceMeter:
         Whether the surface bounds a solid.
     tolerance_m : float
         How far apart the two bounds may be, above 0.
+    solid_faces : (T, 3) int32, optional
+        What meets in a closed surface; see `hybridve.hull.contact.distance.SurfaceDistance`.
 
     Raises
     ------
     ValueError
-        If the tolerance is not above 0 or there is no triangle.
+        If the tolerance is not above 0, there is no triangle, or a surface that is said to be
+        closed is not.
+
+    Attributes
+    ----------
+    is_closed, tolerance_m
+        As given.
+    error_m : float
+        What a distance within reach may be off by, metres: rounding, some 1e-12, and how far
+        corners that meet are apart, if they are. The bounds of `measure` allow for it.
     """
 
     def __init__(
@@ -191,6 +207,7 @@ class ClearanceMeter:
         *,
         is_closed: bool,
         tolerance_m: float = 1e-4,
+        solid_faces: NDArray[np.int32] | None = None,
     ) -> None:
         if not tolerance_m > 0:
             raise ValueError(f"the tolerance is {tolerance_m} m, expected more than 0")
@@ -202,12 +219,23 @@ class ClearanceMeter:
         self.is_closed = is_closed
         self.tolerance_m = tolerance_m
         self._surface = SurfaceDistance(
-            vertices_world - self._origin_world, faces, is_closed=is_closed
+            vertices_world - self._origin_world,
+            faces,
+            is_closed=is_closed,
+            solid_faces=solid_faces,
         )
         self._size_m = size_m
         exponent = int(np.ceil(np.log2(max(_NEAR_M, _REACH_SIZES * size_m))))
         self._roots_m = [2.0 ** (exponent + more) for more in (0, 2, 4)]
         self._lattice = DistanceLattice(self._surface, self._roots_m[-1])
+        self._rounding_m = self._surface.error_m(_FARTHEST * self._roots_m[-1])
+        # Distances are to the triangles; the surface that decides about inside may be `apart_m`
+        # from them.
+        self.error_m = (
+            self._surface.apart_m
+            + self._rounding_m
+            + _ROUNDOFF * (self._roots_m[-1] + float(np.abs(self._origin_world).max()))
+        )
 
     def closest(
         self, points_world: NDArray[np.float64]
@@ -220,7 +248,10 @@ class ClearanceMeter:
         return distance_m, nearest + self._origin_world, triangle
 
     def signed_distance(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distances (N,) of points (N, 3), metres, negative inside a closed object."""
+        """Return the distances (N,) of points (N, 3), metres, negative inside a closed object.
+
+        Within reach they are right to `error_m`.
+        """
         return self._surface.signed(points_world - self._origin_world)[0]
 
     def measure(
@@ -256,11 +287,9 @@ class ClearanceMeter:
             lowest_m = self._search(root_m, best, asked, stop_above_m, stop_below_m)
             if best.distance_m[0] <= beyond_m or min(lowest_m, beyond_m) > stop_above_m:
                 break
-        return self._found(best, min(lowest_m, beyond_m), root_m, shift_world)
+        return self._found(best, min(lowest_m, beyond_m), shift_world)
 
-    def _found(
-        self, best: Best, lowest_m: float, root_m: float, shift_world: NDArray[np.float64]
-    ) -> Clearance:
+    def _found(self, best: Best, lowest_m: float, shift_world: NDArray[np.float64]) -> Clearance:
         """Return what a search found: the best point, and a bound of all others."""
         origin_world = self._origin_world + shift_world
         upper_m: float = np.inf
@@ -268,7 +297,12 @@ class ClearanceMeter:
         if best.distance_m[0] < np.inf:  # the exact distance of the best point
             signed_m, nearest = self._surface.signed(best.point[None])
             upper_m, on_object = float(signed_m[0]), nearest[0]
-        least_m = min(lowest_m, upper_m) - _ROUNDOFF * root_m
+        error_m = self.error_m + _ROUNDOFF * float(np.abs(shift_world).max())
+        least_m = min(lowest_m, upper_m) - error_m
+        if upper_m > error_m:
+            upper_m += error_m
+        else:  # nearer than rounding can tell is on the surface
+            upper_m = min(upper_m + error_m, 0.0)
         return Clearance(
             lower_m=max(least_m, 0.0),
             upper_m=max(upper_m, 0.0),
@@ -344,6 +378,7 @@ class ClearanceMeter:
             cubes,
             self._lattice.distance_m,
             self._lattice.nearest,
+            self._rounding_m,
             asked,
             best,
         )

@@ -1,23 +1,31 @@
-"""Distances to the surface of a CAD object, in double precision.
+"""Distances to the surface of a CAD object, and on which side of it a point is.
 
-Distances come from libigl's tree of boxes (`igl.AABB`), which computes in double precision.
-Open3D's `RaycastingScene` computes in single precision and names, on meshes with slivers, triangles
-that are up to hundredths of a millimetre farther than the nearest, with no bound that one could
-add. On which side of a closed surface a point lies is asked of Open3D all the same, by the parity
-of three rays: that is no matter of hundredths. Both work in the thread that asks; their pools would
-fight ours.
+Both are our own (`hybridve.hull.contact.surface_tree`): distances in double precision with a bound
+of what rounding does to them, whatever the shape of the triangles, sides without any rounding.
+
+**Inside** is where the surface's winding number is not 0: where it goes round a point, as often as
+it may, in whatever direction.
+
+* A part modelled inside out has -1 inside: its inside is its inside all the same.
+* A cavity modelled as a shell that faces inwards has 1 - 1 = 0: outside.
+* Where two closed shells overlap, or one lies in the other and faces the same way, it is 2: inside.
+  Distance and depth are those of the nearest surface, which may be the other shell's.
+* Of a surface that is not closed the winding number is no integer, so nothing is inside of it. What
+  closed means is told in `hybridve.hull.contact.topology`.
 """
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: Rays that vote on the side; an odd number, three for one that meets an edge.
-_N_RAYS = 3
-
-#: Within this share of the object's size rays in single precision cannot tell the side.
-_SIDE_PRECISION = 1e-6
+from hybridve.hull.contact.predicates import LEAST, within_range
+from hybridve.hull.contact.surface_tree import (
+    DISTANCE_ERROR,
+    are_in_solid,
+    closest_on_surface,
+    make_tree,
+    winding_numbers,
+)
+from hybridve.hull.contact.topology import meeting_faces
 
 
 class SurfaceDistance:
@@ -31,72 +39,87 @@ class SurfaceDistance:
         Vertex numbers; at least one triangle.
     is_closed : bool
         Whether the surface bounds a solid: distances are negative inside.
+    solid_faces : (T, 3) int32, optional
+        Of a closed surface: the same triangles in numbers that are equal where corners meet
+        (`hybridve.hull.contact.topology.meeting_faces`), as its file has them. By default found
+        here, which serves unless what meets in the file was moved apart by rounding since.
+
+    Attributes
+    ----------
+    is_closed : bool
+        As given.
+    apart_m : float
+        How far the corners that meet in `solid_faces` are apart: the solid that decides what is
+        inside has its surface no farther from the triangles. 0 but for noise.
+
+    Raises
+    ------
+    ValueError
+        If a surface that is said to be closed is not.
     """
 
     def __init__(
-        self, vertices: NDArray[np.float64], faces: NDArray[np.int32], *, is_closed: bool
+        self,
+        vertices: NDArray[np.float64],
+        faces: NDArray[np.int32],
+        *,
+        is_closed: bool,
+        solid_faces: NDArray[np.int32] | None = None,
     ) -> None:
-        import igl  # late: the import takes a fifth of a second
-
         self.is_closed = is_closed
-        self._vertices = np.ascontiguousarray(vertices, np.float64)
-        self._faces = np.ascontiguousarray(faces, np.int64)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._faces)
-        used = self._vertices[self._faces.ravel()]
-        self._lower, self._upper = used.min(axis=0), used.max(axis=0)
-        self._size_m = float(np.abs(used).max())
-        self._rays: Any = None
+        self.apart_m = 0.0
+        corners = np.asarray(vertices[faces], np.float64)  # (T, 3, 3)
+        solid = within_range(corners)
+        if is_closed:
+            if solid_faces is None:
+                solid_faces = meeting_faces(vertices, faces)
+            if solid_faces is None:
+                raise ValueError("the surface is said to be closed, but its edges do not meet")
+            solid = within_range(vertices[solid_faces])
+            counts = (solid_faces != solid_faces[:, :1]).any(axis=1)
+            self.apart_m = float(
+                np.linalg.norm(solid[counts] - corners[counts], axis=2).max(initial=0.0)
+            )
+        self._tree = make_tree(corners, solid)
 
     def closest(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Return the distances (N,) of points (N, 3), the nearest points (N, 3), their triangles.
 
-        The distances are not negative, and correct to rounding in double precision.
+        The distances are not negative, and right to `error_m`. Of triangles that are equally near
+        the first is named.
         """
-        if len(points) == 0:
-            return np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64)
-        squared, triangle, nearest = self._tree.squared_distance(
-            self._vertices, self._faces, np.ascontiguousarray(points, np.float64)
-        )
-        return (
-            np.sqrt(squared).reshape(-1),
-            nearest.reshape(-1, 3),
-            np.asarray(triangle, np.int64).reshape(-1),
-        )
+        return closest_on_surface(np.ascontiguousarray(points, np.float64), self._tree)
+
+    def error_m(self, distance_m: float) -> float:
+        """Return what a distance up to `distance_m` may be off by, by rounding."""
+        # Squares of what is below 2^-300 m may underflow.
+        return DISTANCE_ERROR * (distance_m + self._tree.longest_m) + LEAST
 
     def signed(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the signed distances (N,) of points (N, 3), and the nearest points (N, 3).
 
-        Of a surface that is not closed they are not negative. A point within a millionth of the
-        object's size of the surface counts as outside.
+        Of a surface that is not closed they are not negative. The sign is exact for every point
+        off the surface (of the solid, see `apart_m`); on it, distances are 0 to `error_m`.
         """
-        distance_m, nearest, _ = self.closest(points)
+        points = np.ascontiguousarray(points, np.float64)
+        distance_m, nearest, _ = closest_on_surface(points, self._tree)
         if self.is_closed:
-            doubtful = (
-                ((points > self._lower) & (points < self._upper)).all(axis=1)
-                & (distance_m > _SIDE_PRECISION * self._size_m)
-            )  # fmt: skip
-            within = np.flatnonzero(doubtful)
-            within = within[self._is_within(points[within])]
-            distance_m[within] *= -1.0
+            inside = are_in_solid(within_range(points), distance_m, self.apart_m, self._tree)
+            distance_m[inside] *= -1.0
         return distance_m, nearest
 
-    def _is_within(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        if len(points) == 0:
-            return np.zeros(0, np.bool_)
-        import open3d  # late: the import alone takes up to a second
+    def winding(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return how often a closed surface goes round points (N, 3): an integer each, exactly.
 
-        if self._rays is None:
-            self._rays = open3d.t.geometry.RaycastingScene(nthreads=1)
-            self._rays.add_triangles(
-                open3d.core.Tensor.from_numpy(self._vertices.astype(np.float32)),
-                open3d.core.Tensor.from_numpy(self._faces.astype(np.uint32)),
-            )
-        occupied = self._rays.compute_occupancy(
-            open3d.core.Tensor.from_numpy(points.astype(np.float32)), nthreads=1, nsamples=_N_RAYS
-        )
-        return np.asarray(occupied.numpy() > 0.5)
+        Raises
+        ------
+        ValueError
+            If the surface is not closed: there is no such number.
+        """
+        if not self.is_closed:
+            raise ValueError("the surface is not closed, so that it goes round nothing")
+        return winding_numbers(within_range(np.ascontiguousarray(points, np.float64)), self._tree)

@@ -13,9 +13,14 @@ is the smallest of linear functions of x, so it is concave, whatever the surface
   and d(x)^2 <= (|x - y_i|^2 + |x - y_j|^2) / 2 for each pair, which is convex in x and so largest
   at a corner of a cell. A pair across the middle of a plate, or of a rod, bounds the depth there.
 
+A rounded distance may be off by some e, and d^2 by e (2 d + e): that, and the rounding of the sums,
+is taken off before the root is drawn, as near the surface little d^2 is much d.
+
 Both are off by no more than some H^2 / d for a cube with edge 2 H, where bounds from a metre a
 metre are off by H: once a cube's corners are known, cells far smaller need no distance of their
-own. A cube that the surface does not meet lies on one side of it, that of its corners.
+own. A cube that the surface does not meet lies on one side of it, that of its corners. It is not
+met if all corners are farther from the surface than from the cube's centre: a point in the cube,
+and any up to 2 H from the centre, is nearer to some corner than that.
 """
 
 from typing import NamedTuple
@@ -35,6 +40,10 @@ FINEST_LEVEL = 20
 
 #: An odd number that spreads keys over a table (2^64 over the golden ratio, as a signed one).
 _SPREAD = -7046029254386353131
+
+#: What rounding may add to an interpolated F, in the largest d^2 and |x - c|^2 of the corners: a
+#: dozen sums and products that each keep 2^-53 of it.
+_SUM_ERROR = 2.0**-48
 
 #: On which side of a closed surface a cube lies: inside, either or both, outside. An open surface
 #: has an outside alone.
@@ -137,6 +146,7 @@ class DistanceLattice:
             self.distance_m,
             self.nearest,
             self._surface.is_closed,
+            self._surface.apart_m,
             fine_m,
         )
         return Cubes(center, np.full(len(center), half_m), corner, side, is_fine)
@@ -234,9 +244,13 @@ def _judge(
     distance_m: NDArray[np.float64],
     nearest: NDArray[np.float64],
     is_closed: bool,
+    apart_m: float,
     fine_m: float,
 ) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-    """Return on which side of the surface cubes lie, and which have bounds that are close."""
+    """Return on which side of the surface cubes lie, and which have bounds that are close.
+
+    The solid's surface, whose side is asked for, may be `apart_m` from that of the distances.
+    """
     side, is_fine = np.zeros(len(center), np.int8), np.zeros(len(center), np.bool_)
     for i in range(len(center)):
         smallest, mean, largest_m, above = np.inf, 0.0, 0.0, np.inf
@@ -251,9 +265,10 @@ def _judge(
                 squared += (center[i, axis] - nearest[corner[i, k], axis]) ** 2
             above = min(above, squared)
         diagonal = 3.0 * half_m * half_m
+        unmet_m = np.sqrt(diagonal) + apart_m
         if not is_closed:
             side[i] = _OUTSIDE
-        elif smallest > diagonal:  # the surface does not meet the cube
+        elif smallest > unmet_m * unmet_m:  # the surface does not meet the cube
             side[i] = _OUTSIDE if largest_m > 0 else _INSIDE
         else:
             side[i] = _ACROSS
@@ -272,9 +287,11 @@ def _least_squared(
     cube_half_m: float,
     corner: NDArray[np.int64],
     distance_m: NDArray[np.float64],
+    error_m: float,
     value: NDArray[np.float64],
 ) -> float:
     """Return a lower bound of the squared distance in a cell of a cube; `value` (8,) is room."""
+    farthest_m, away = 0.0, 0.0
     low_x = 0.5 + (x - half_m - cube_center[0]) / (2.0 * cube_half_m)
     low_y = 0.5 + (y - half_m - cube_center[1]) / (2.0 * cube_half_m)
     low_z = 0.5 + (z - half_m - cube_center[2]) / (2.0 * cube_half_m)
@@ -283,7 +300,9 @@ def _least_squared(
         off_x = cube_center[0] + (cube_half_m if k & 1 else -cube_half_m) - x
         off_y = cube_center[1] + (cube_half_m if k & 2 else -cube_half_m) - y
         off_z = cube_center[2] + (cube_half_m if k & 4 else -cube_half_m) - z
-        value[k] = distance_m[corner[k]] ** 2 - (off_x * off_x + off_y * off_y + off_z * off_z)
+        off = off_x * off_x + off_y * off_y + off_z * off_z
+        value[k] = distance_m[corner[k]] ** 2 - off
+        farthest_m, away = max(farthest_m, abs(distance_m[corner[k]])), max(away, off)
     least = np.inf
     for across in range(2):
         share_x = low_x + across * step
@@ -297,7 +316,8 @@ def _least_squared(
             high = c + share_y * (d - c)
             least = min(least, low + low_z * (high - low))
             least = min(least, low + (low_z + step) * (high - low))
-    return least
+    rounding = error_m * (2.0 * farthest_m + error_m)
+    return least - rounding - _SUM_ERROR * (farthest_m * farthest_m + away)
 
 
 @compiled
@@ -347,6 +367,7 @@ def bound_cells(
     cubes: Cubes,
     distance_m: NDArray[np.float64],
     nearest: NDArray[np.float64],
+    error_m: float,
     asked: CellFrame,
     best: Best,
 ) -> tuple[NDArray[np.float64], int]:
@@ -364,6 +385,8 @@ def bound_cells(
         The cube that holds each.
     cubes, distance_m, nearest
         The cubes, and the lattice of their corners.
+    error_m : float
+        What each of these distances may be off by.
     asked : CellFrame
         The hull.
     best : Best
@@ -372,6 +395,7 @@ def bound_cells(
     Returns
     -------
     lower_m : (N,) float64
+        Right but for `error_m`.
     deepest : int
         The cell with the lowest bound of those whose centre is in the hull and may lie in the
         solid, else the one nearest to the surface of those that this may cross; -1 if there is
@@ -394,7 +418,16 @@ def bound_cells(
         side, corner = cubes.side[k], cubes.corner[k]
         if side == _OUTSIDE:
             least = _least_squared(
-                x, y, z, half_m, cubes.center[k], cubes.half_m[k], corner, distance_m, value
+                x,
+                y,
+                z,
+                half_m,
+                cubes.center[k],
+                cubes.half_m[k],
+                corner,
+                distance_m,
+                error_m,
+                value,
             )
             lower_m[i] = np.sqrt(max(least, 0.0))
         elif side == _INSIDE:

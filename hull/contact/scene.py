@@ -29,7 +29,7 @@ from hybridve.calib.pose import placed, rotation_about_axes
 from hybridve.hull.contact.mesh import TESSELLATION_M, CadFile, kind_of, read_cad
 from hybridve.hull.contact.part import Part, Up
 from hybridve.hull.contact.readers import FORMATS, TESSELLATED, WITH_UNIT
-from hybridve.hull.contact.topology import Topology
+from hybridve.hull.contact.topology import Topology, meeting_faces
 from hybridve.hull.toml_io import expand_root, explain_validation, read_toml
 
 #: How many metres one unit of a mesh file is.
@@ -113,6 +113,9 @@ class SceneObject:
         reference point, in the frame of the mesh, after that was turned z up.
     is_closed : bool
         Whether the surface closes off a volume, so that inside and outside can be told apart.
+    solid_faces : (T, 3) int32 or None
+        Of a closed surface, its triangles in numbers that are equal where corners meet in the file;
+        see `hybridve.hull.contact.topology.meeting_faces`.
     color : tuple of 4 floats, or None
         What the file says of its colour, 0 to 1, as a picture shows it (sRGB), and its opacity.
     about : dict
@@ -131,6 +134,7 @@ class SceneObject:
     reference_point_world: NDArray[np.float64]
     recovery_direction: NDArray[np.float64] | None
     is_closed: bool = False
+    solid_faces: NDArray[np.int32] | None = None
     color: tuple[float, float, float, float] | None = None
     about: dict[str, Any] = field(default_factory=dict)
     vertices_mesh: NDArray[np.float64] | None = None
@@ -310,6 +314,7 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             reference_point_world=reference_point_world,
             recovery_direction=direction,
             is_closed=topology.closed,
+            solid_faces=meeting_faces(part.vertices, part.faces) if topology.closed else None,
             color=part.rgba,
             about=about | _about_mesh(part, topology, unit_m),
             vertices_mesh=vertices_mesh,

@@ -267,7 +267,7 @@ def _violated_on_line(
     along_m = np.concatenate([-steps_m[::-1], [0.0], steps_m])
     unmoved_world = point_world - shift_m * direction
     distance_m = one.meter.signed_distance(unmoved_world + along_m[:, None] * direction)
-    spare_m = one.clearance_m - distance_m
+    spare_m = one.clearance_m - distance_m - one.meter.error_m
     near = spare_m > 0
     near_m = union(np.column_stack([along_m[near] - spare_m[near], along_m[near] + spare_m[near]]))
     if len(near_m) == 0:  # the point of the surface, and no clearance required

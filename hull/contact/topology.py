@@ -3,9 +3,13 @@
 Files repeat a vertex for every face that uses it (STL) or for every normal (glTF, STEP), so edges
 are compared between vertices of equal coordinates, in the numbers of the file. An edge is fine when
 exactly two triangles use it, in opposite directions. A mesh is closed when all its edges are; then
-inside and outside can be told apart everywhere. The rule is strict: two cubes that share an edge,
-or a solid that is there twice, are not closed, because counting their surfaces along a ray gives an
-answer that depends on who counts. The mesh itself is never touched.
+how often its surface goes round a point is an integer for every point that is not on it, and inside
+and outside can be told apart everywhere (`hybridve.hull.contact.distance` says what inside is).
+Where two triangles use an edge in the same direction the number is none: such a mesh is not closed.
+The rule is stricter than that: two cubes that share an edge, or a solid that is there twice, are
+not closed either. For where more than two triangles meet at an edge, walls may be there from both
+sides, as made for pictures; these go round nothing, and all within would count as outside. The mesh
+itself is never touched.
 
 Two things that files are full of do not count against a mesh.
 
@@ -22,6 +26,7 @@ allowed; the edges are counted as the file has them all the same.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,28 +73,84 @@ def examine_topology(vertices: NDArray[np.float64], faces: NDArray[np.int32]) ->
     faces : (T, 3) int32
         Vertex numbers, counter-clockwise seen from outside.
     """
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    has_area = np.linalg.norm(np.cross(b - a, c - a), axis=1) != 0
-    places = _places(vertices, 0.0)[faces]  # (T, 3)
-    counts = _bad_edges(places, has_area)
-    closed_within = None
-    if has_area.any():
-        if not any(counts):
-            closed_within = 0.0
-        else:
-            noise = float(np.abs(vertices[faces]).max()) * 2.0**-22
-            places = _places(vertices, noise)[faces]
-            # No triangle may be lost: what is as fine as the noise cannot be told from a crack.
-            if _has_three_corners(places)[has_area].all() and not any(_bad_edges(places, has_area)):
-                closed_within = noise
+    has_area = _has_area(vertices, faces)
+    meeting = _meet(vertices, faces, has_area)
+    counts = meeting.counts
     return Topology(
         n_zero_area=int((~has_area).sum()),
         n_open_edges=counts[0],
         n_nonmanifold_edges=counts[1],
         n_inconsistent_edges=counts[2],
-        closed_within=closed_within,
-        volume=None if closed_within is None else _volume(a, b, c),
+        closed_within=meeting.within,
+        volume=None if meeting.within is None else _volume(*np.moveaxis(vertices[faces], 1, 0)),
     )
+
+
+def meeting_faces(
+    vertices: NDArray[np.float64], faces: NDArray[np.int32]
+) -> NDArray[np.int32] | None:
+    """Return a closed mesh in vertex numbers that are equal where corners meet.
+
+    Whatever rounding does to the vertices when they are placed, the surface stays closed in these
+    numbers.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64
+        As the file has them: after they were turned, what met may be apart.
+    faces : (T, 3) int32
+        Vertex numbers.
+
+    Returns
+    -------
+    (T, 3) int32 or None
+        Each corner's place is the vertex with the lowest number there. A triangle without which the
+        mesh is closed has one number thrice. None if the mesh is not closed.
+    """
+    meeting = _meet(vertices, faces, _has_area(vertices, faces))
+    if meeting.within is None:
+        return None
+    _, lowest = np.unique(meeting.places, return_index=True)
+    numbers = lowest[meeting.places][faces]
+    numbers[~meeting.counted] = numbers[~meeting.counted][:, :1]
+    return numbers.astype(np.int32)
+
+
+def _has_area(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    result: NDArray[np.bool_] = np.linalg.norm(np.cross(b - a, c - a), axis=1) != 0
+    return result
+
+
+class _Meeting(NamedTuple):
+    """Where corners meet.
+
+    `places` (V,) are numbers of places from 0 on, `counted` (T,) the triangles that edges were
+    compared between, `counts` the edges that are open, non-manifold and inconsistent in the numbers
+    of the file, and `within` what `Topology.closed_within` is.
+    """
+
+    places: NDArray[np.int64]
+    counted: NDArray[np.bool_]
+    counts: tuple[int, int, int]
+    within: float | None
+
+
+def _meet(
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], has_area: NDArray[np.bool_]
+) -> _Meeting:
+    places = _places(vertices, 0.0)
+    counts, counted = _bad_edges(places[faces], has_area)
+    if not has_area.any():
+        return _Meeting(places, counted, counts, None)
+    if not any(counts):
+        return _Meeting(places, counted, counts, 0.0)
+    noise = float(np.abs(vertices[faces]).max()) * 2.0**-22
+    places = _places(vertices, noise)
+    bad, counted = _bad_edges(places[faces], has_area)
+    # No triangle may be lost: what is as fine as the noise cannot be told from a crack.
+    is_closed = not any(bad) and _has_three_corners(places[faces])[has_area].all()
+    return _Meeting(places, counted, counts, noise if is_closed else None)
 
 
 def _places(vertices: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
@@ -118,8 +179,10 @@ def _has_three_corners(places: NDArray[np.int64]) -> NDArray[np.bool_]:
     return result
 
 
-def _bad_edges(places: NDArray[np.int64], has_area: NDArray[np.bool_]) -> tuple[int, int, int]:
-    """Return how many edges are open, non-manifold and inconsistent.
+def _bad_edges(
+    places: NDArray[np.int64], has_area: NDArray[np.bool_]
+) -> tuple[tuple[int, int, int], NDArray[np.bool_]]:
+    """Return how many edges are open, non-manifold and inconsistent, and of which triangles.
 
     Of triangles (T, 3) with three corners; or, if there is none among those with area, of these.
     """
@@ -128,8 +191,8 @@ def _bad_edges(places: NDArray[np.int64], has_area: NDArray[np.bool_]) -> tuple[
     if any(counts) and (has_three_corners & ~has_area).any():
         without = _count_edges(places[has_three_corners & has_area])
         if not any(without):
-            return without
-    return counts
+            return without, has_three_corners & has_area
+    return counts, has_three_corners
 
 
 def _count_edges(places: NDArray[np.int64]) -> tuple[int, int, int]:

@@ -14,7 +14,6 @@ PACKAGES = (
     "numba",
     "moderngl",
     "h5py",
-    "libigl",
     "scipy",
     "open3d-cpu",
     "open3d",

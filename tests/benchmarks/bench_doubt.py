@@ -59,7 +59,13 @@ def bench_doubt(benchmark: Any, hulls: list[Hull], near_m: float) -> None:
     links = load_scene(FOLDER / "scene.toml").objects
     bodies = [make_body(link, viewport=10) for link in links]
     meters = [
-        ClearanceMeter(link.vertices_world, link.faces, is_closed=link.is_closed) for link in links
+        ClearanceMeter(
+            link.vertices_world,
+            link.faces,
+            is_closed=link.is_closed,
+            solid_faces=link.solid_faces,
+        )
+        for link in links
     ]
     seen: list[Seen] = []
     with Native(1) as engine:

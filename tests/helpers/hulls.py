@@ -125,6 +125,7 @@ def sphere_mesh(
     directions = np.stack(
         [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
     )
+    directions[-1] = [0.0, 0.0, -1.0]  # closed: the sine of pi is not quite 0
     row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = a + columns, b + columns
