@@ -164,10 +164,10 @@ def check_session(session: Session, rig: Rig, progress: Progress | None = None) 
         If no board can be found, or fewer than two cameras of the rig see one.
     """
     boards = session_boards(session)
-    sightings = find_boards(
+    observations = find_boards(
         boards, _inputs(session), progress=progress, cache=_corner_cache(session)
     )
-    return check_rig(rig, boards, sightings)
+    return check_rig(rig, boards, observations)
 
 
 def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, int]]) -> Rig:
