@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +141,7 @@ class Moved:
     p_value: float | None
 
 
-class NotTestable(CalibrationError):
+class NotTestableError(CalibrationError):
     """Nothing was seen by which a rig could be tested: it is neither right nor wrong."""
 
 
@@ -214,9 +215,7 @@ class RigCheck:
     n_placements: int
 
 
-def check_rig(
-    rig: Rig, boards: Sequence[Board], observations: Sequence[Observations]
-) -> RigCheck:
+def check_rig(rig: Rig, boards: Sequence[Board], observations: Sequence[Observations]) -> RigCheck:
     """Check a rig against boards that several of its cameras saw at once.
 
     Each board at each moment is placed in the rig's world by position and orientation, all at one
@@ -236,7 +235,7 @@ def check_rig(
 
     Raises
     ------
-    NotTestable
+    NotTestableError
         If fewer than two cameras of the rig see a board at once.
     CalibrationError
         If a lens cannot have seen what its camera did.
@@ -263,6 +262,24 @@ def _exchange(
     exchanged = dict(sightings)
     exchanged[first], exchanged[second] = sightings[second], sightings[first]
     return exchanged
+
+
+def check_from_dict(told: Mapping[str, Any]) -> RigCheck:
+    """Return what `dataclasses.asdict` made plain, and JSON may have kept."""
+    pair = told["exchanged"]
+    return RigCheck(
+        **{
+            **told,
+            "moved": {name: Moved(**one) for name, one in told["moved"].items()},
+            "turned": {name: Turned(**one) for name, one in told["turned"].items()},
+            "turned_sides": tuple(tuple(side) for side in told["turned_sides"]),
+            "twins": tuple(tuple(group) for group in told["twins"]),
+            "suspects": tuple(told["suspects"]),
+            "undecided": tuple(told["undecided"]),
+            "untested": tuple(told["untested"]),
+            "exchanged": None if pair is None else (pair[0], pair[1]),
+        }
+    )
 
 
 # --- What was seen ----------------------------------------------------------------------------
@@ -490,7 +507,7 @@ class _Case:
             told = f"{len(seeing)} of its cameras see the board, expected two or more"
             if len(seeing) > 1:
                 told = "no two of its cameras see the board at the same time"
-            raise NotTestable(
+            raise NotTestableError(
                 f"the rig cannot be checked: {told} (rig: "
                 f"{', '.join(camera.name for camera in rig.cameras)}; board: "
                 f"{', '.join(seeing) or 'none'})"
@@ -858,9 +875,7 @@ class _Case:
             ListedView(camera_of[view.camera], place_of[view.moment], view.moment[1], view.look)
             for view in self.views
         ]
-        around = {
-            camera_of[name]: seen for name, seen in observations.items() if name in camera_of
-        }
+        around = {camera_of[name]: seen for name, seen in observations.items() if name in camera_of}
         return judge_turns(self.boards, placed, views, self.limits_px, around)
 
     # --- Two cameras in each other's place ---

@@ -222,7 +222,11 @@ def _join_by_boards(
 
 
 def _tells(
-    boards: Sequence[Board], placed: Placed, camera: int, seen: Sequence[ListedView], limit_px: float
+    boards: Sequence[Board],
+    placed: Placed,
+    camera: int,
+    seen: Sequence[ListedView],
+    limit_px: float,
 ) -> bool:
     """Tell whether boards exclude every turn about one of them that leaves its look."""
     first = min(seen, key=lambda view: len(boards[view.board].looks))
@@ -299,9 +303,7 @@ def _accused(
     if len(counts) == 1:
         return {}, ()
     across = [
-        (i, j)
-        for i, j in combinations(range(len(seeing)), 2)
-        if chosen.looks[i] != chosen.looks[j]
+        (i, j) for i, j in combinations(range(len(seeing)), 2) if chosen.looks[i] != chosen.looks[j]
     ]
     speaking = sum(votes[i, j, (chosen.looks[j] - chosen.looks[i]) % n_looks] for i, j in across)
     sigma = sigmas_apart(float(speaking), float(sum(votes[i, j, 0] for i, j in across)))

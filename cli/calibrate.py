@@ -154,7 +154,8 @@ def _check(
     session: "Session", source: Path, unit: str | None, stages: StageProgress, *, as_json: bool
 ) -> None:
     from hybridve.calib.rig_io import read_any_rig
-    from hybridve.hull.capture.rig import board_sizes, check_session
+    from hybridve.hull.capture.rig import board_sizes
+    from hybridve.hull.capture.rig_check import check_session
 
     names = [camera.name for camera in session.cameras]
     sizes_px = set(board_sizes(session).values())
