@@ -148,20 +148,14 @@ def judge_turns(
                 votes[i, j, 0] += _CERTAIN
         chosen = choose_looks(votes)
         weak = {seeing[place] for place in _weak(chosen)}
-        found, accused = _accused(board, number, placed, views, seeing, votes, chosen)
-        accused = tuple(
-            sure
-            for side in accused
-            if (sure := tuple(camera for camera in side if camera not in weak))
-        )
+        # Cameras of which nothing is known count neither as guilty nor as witnesses.
+        sure = [place for place, camera in enumerate(seeing) if camera not in weak]
+        found, accused = _accused(board, number, placed, views, seeing, votes, chosen, sure)
         sides += accused
-        turned |= {camera: found[camera] for side in accused for camera in side}
-        doubtful = {
-            camera
-            for camera, look in zip(seeing, chosen.looks, strict=True)
-            if look != _most(chosen.looks) and camera not in turned
-        }
-        unsure |= weak | doubtful
+        turned |= found
+        unsure |= weak
+        if not found and len({chosen.looks[place] for place in sure}) > 1:
+            unsure |= set(seeing)  # the scene is against the rig, but not clearly
         groups.join([camera for camera in seeing if camera not in unsure and camera not in turned])
     apart = groups.apart() - set(turned)
     return Turns(turned, sides, tuple(sorted(apart)))
@@ -270,11 +264,6 @@ def _turn(look: int, n_looks: int) -> Pose:
 # --- What the scene tells ---------------------------------------------------------------------
 
 
-def _most(looks: Sequence[int]) -> int:
-    """Return the look that most cameras have."""
-    return Counter(looks).most_common(1)[0][0]
-
-
 def _weak(chosen: LooksByVote) -> set[int]:
     """Return the cameras that might be turned against the votes: of each weak side, the fewer."""
     everyone = frozenset(range(len(chosen.looks)))
@@ -296,15 +285,14 @@ def _accused(
     seeing: Sequence[int],
     votes: NDArray[np.float64],
     chosen: LooksByVote,
+    sure: Sequence[int],
 ) -> tuple[dict[int, Turned], tuple[tuple[int, ...], ...]]:
     """Return the cameras that the scene clearly has elsewhere, and of which sides it may be."""
     n_looks = len(board.looks)
-    counts = Counter(chosen.looks).most_common()
-    if len(counts) == 1:
+    counts = Counter(chosen.looks[place] for place in sure).most_common()
+    if len(counts) < 2:
         return {}, ()
-    across = [
-        (i, j) for i, j in combinations(range(len(seeing)), 2) if chosen.looks[i] != chosen.looks[j]
-    ]
+    across = [(i, j) for i, j in combinations(sure, 2) if chosen.looks[i] != chosen.looks[j]]
     speaking = sum(votes[i, j, (chosen.looks[j] - chosen.looks[i]) % n_looks] for i, j in across)
     sigma = sigmas_apart(float(speaking), float(sum(votes[i, j, 0] for i, j in across)))
     if sigma < CLEAR_EVIDENCE:
@@ -313,7 +301,8 @@ def _accused(
     by_look: dict[int, list[int]] = {}
     place_of = {view.camera: view.place for view in views if view.board == number}
     turned = {}
-    for camera, look in zip(seeing, chosen.looks, strict=True):
+    for place in sure:
+        camera, look = seeing[place], chosen.looks[place]
         against = next((other for other in most if other != look), look)
         if against == look:
             continue  # the side of most cameras

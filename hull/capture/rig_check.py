@@ -109,7 +109,7 @@ def examined(session: Session, rig: Rig, label: str, progress: Progress | None =
         )
     elif found.check is not None and found.check.untested:
         _log.warning(
-            "%s: nothing tests where %s stand: no board was seen there together with others",
+            "%s: not tested: %s; no board was seen there together with others",
             place,
             ", ".join(found.check.untested),
         )

@@ -48,7 +48,7 @@ def around(
             0.0, 0.1, (board.columns * board.rows, 2)
         )
         corners = corners[board.looks[rng.integers(len(board.looks))]]
-        picture = render_board(camera, board, floor=floor, samples=2, noise_grey=1.0)
+        picture = render_board(camera, board, floor=floor, samples=1, noise_grey=1.0)
         cameras.append(camera)
         seen.append(
             Observations(
