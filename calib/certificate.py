@@ -45,9 +45,10 @@ _SHARE = 0.95
 #: Cells across and down an image in which coverage is counted.
 _CELLS = (8, 6)
 
-#: A parameter of a lens is not determined if points move by more than this (pixels), somewhere in
-#: the image or in the working volume, when it moves by its standard deviation: outlines are found
-#: to a pixel, and what moves them by less changes nothing that is seen.
+#: A parameter of a lens is not determined if points move by more than this (pixels), in the image
+#: or in the working volume but for their outermost `_SHARE`, when it moves by its standard
+#: deviation: outlines are found to a pixel, and what moves them by less changes nothing that is
+#: seen. How well the very corners are known is told by itself.
 _UNSURE_PX = 1.0
 
 #: Places across and down an image at which that is asked.
@@ -131,9 +132,9 @@ class CameraCertificate:
     edge_error95_px : float
         The same for the whole image, at the middle distance of the volume, where it is largest.
     moved_px : dict of str to float
-        By parameter of its lens how far points of the image or of the working volume move at most
-        when it moves by its standard deviation: by itself, or with what it is tied to, whichever
-        is less. Without those that were given.
+        By parameter of its lens how far points move when it moves by its standard deviation, in
+        95 % of the image or of the working volume, whichever is more: by itself, or with what it is
+        tied to, whichever is less. Without those that were given.
     undetermined : tuple of str
         Those among them that the pictures do not tell, worst first: points move by more than a
         pixel.
@@ -491,17 +492,16 @@ def _moved_px(alone: Rig, pixels: NDArray[np.float64], volume: Volume) -> dict[s
         by_itself[column] = deviations[column]
         tied = matrix[:, column] / deviations[column]
         moved_px[name] = min(
-            max(_largest(image @ change, 1.0), _largest(space @ change, _SHARE))
-            for change in (by_itself, tied)
+            max(_largest(image @ change), _largest(space @ change)) for change in (by_itself, tied)
         )
     return moved_px
 
 
-def _largest(moves_px: NDArray[np.float64], share: float) -> float:
-    """Return the length that a share of moves (N, 2) keeps, of those that are known."""
+def _largest(moves_px: NDArray[np.float64]) -> float:
+    """Return the length that all moves (N, 2) but the largest keep, of those that are known."""
     lengths = np.linalg.norm(moves_px, axis=1)
     lengths = lengths[np.isfinite(lengths)]
-    return float(np.quantile(lengths, share)) if len(lengths) else 0.0
+    return float(np.quantile(lengths, _SHARE)) if len(lengths) else 0.0
 
 
 def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> tuple[str, ...]:

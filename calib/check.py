@@ -63,12 +63,11 @@ ZOOM_TOLERANCE = 0.05
 _ZOOM_SIGMAS = 4.0
 
 #: With a covariance: a rig is accused if what it shows happens in less than this share of rigs
-#: that have not been touched; each camera's part in it alone, or all of it together.
-SIGNIFICANCE = 0.01
-
-#: Where a rig is known to be wrong, the rest of its cameras agree unless this is how rare they are:
-#: what chance does to them must not hide who was moved.
-_REST_SIGNIFICANCE = 1e-4
+#: that have not been touched; each camera's part in it alone, or all of it together. Every rig is
+#: tested in every session that uses it, so that good ones must hardly ever be accused; a camera
+#: moved by 5 mm and 0.3 degrees at 2 m shows by less than 1 in 10^17 all the same. What chance
+#: does to the rest of a rig that is known to be wrong must not hide who was moved, either.
+SIGNIFICANCE = 1e-4
 
 #: The squares of a board are known to this share, by a ruler: a smaller scale is told, not blamed.
 _SQUARES_KNOWN = 0.005
@@ -744,7 +743,6 @@ class _Case:
         p_alone = {i: chance_of(max(statistic - alone[i], 0.0), POSE) for i in cameras}
         if n_cameras > 2:  # the whole, and each camera: the least of these probabilities
             p_value = min(1.0, 2.0 * p_value, 2.0 * n_cameras * min(p_alone.values()))
-        allowed = SIGNIFICANCE if n_cameras == len(self.names) else _REST_SIGNIFICANCE
         within = all(rms_px[index] <= self.limits_px[index] for index in cameras)
         return _State(
             cameras,
@@ -756,7 +754,7 @@ class _Case:
             p_value,
             whole.log_scale,
             whole.log_scale_sigma,
-            within if covariance is None else p_value >= allowed,
+            within if covariance is None else p_value >= SIGNIFICANCE,
         )
 
     def _apart(self, cameras: tuple[int, ...]) -> _State:

@@ -247,13 +247,13 @@ def exchanged(
 
 
 def test_an_untouched_rig_is_accused_as_rarely_as_is_said() -> None:
-    """At most SIGNIFICANCE of the rigs: of 15, two or more are accused once in 100 such tests."""
+    """At most SIGNIFICANCE of the rigs: of 15, one is accused once in 600 such tests."""
     checks = [
         examine(calibrated(seed), [CALIBRATED], seen_by(truth(), seed=1000 + seed))
         for seed in range(N_SEEDS)
     ]
 
-    assert sum(not check.is_trustworthy for check in checks) <= 1
+    assert all(check.is_trustworthy for check in checks)
     # The probabilities are not all near one either: some of 15 should be below a half.
     values = [check.p_value for check in checks if check.p_value is not None]
     assert len(values) == N_SEEDS
