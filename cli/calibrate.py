@@ -88,7 +88,8 @@ class BoxMillimetres(click.ParamType["Box"]):
     type=click.Path(path_type=Path),
     metavar="RIG",
     help="Calibrate nothing: test this rig, of any format, against the boards of SESSION, and name "
-    f"the camera that is wrong. Exit status {NOT_GOOD_ENOUGH} if it does not fit.",
+    f"the camera that is wrong. Exit status {NOT_GOOD_ENOUGH} if it does not fit, or nothing "
+    "tells.",
 )
 @click.option(
     "--rig-unit",

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.boards import look_at, make_camera, render_board
+from helpers.boards import floor_of_noise, look_at, make_camera, render_board, turned_about
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
@@ -17,6 +17,7 @@ from hybridve.calib.pose import compose, rotation_about_axes
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import read_rig, write_rig
 from hybridve.calib.target import Chessboard
+from hybridve.cli.calibrate import NOT_GOOD_ENOUGH
 from hybridve.hull.capture import rig_check
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.rig_check import ask_boards, check_session, remember_made
@@ -24,6 +25,7 @@ from hybridve.hull.capture.session import load_session
 
 SIZE_PX = (320, 240)
 BOARD = Chessboard(7, 6, 0.1)
+SYMMETRIC = Chessboard(8, 6, 0.1)
 NAMES = ("cam1", "cam2", "cam3")
 
 
@@ -293,6 +295,45 @@ def test_cameras_with_one_view_are_named_wherever_a_rig_is_loaded(
     assert any("cameras 'cam1' and 'cam2' have one recording" in s for s in said)
     assert len(said) == 2
     del second
+
+
+def lie_symmetric_board(session: Path, is_textured: bool) -> None:
+    """Put a board that looks the same turned into the place of the other."""
+    floor = floor_of_noise(4) if is_textured else None
+    for camera in cameras():
+        picture = render_board(camera, SYMMETRIC, floor=floor, samples=2)
+        cv2.imwrite(str(session.parent / camera.name / "board.png"), picture)
+    text = session.read_text(encoding="utf-8")
+    session.write_text(text.replace("columns = 7", "columns = 8"), encoding="utf-8")
+
+
+def test_a_camera_turned_about_a_board_that_looks_the_same_then_is_refused(session: Path) -> None:
+    lie_symmetric_board(session, is_textured=True)
+    assert told(load(session))[0] == "agrees"
+    first, second, third = cameras()
+    write_rows(session.parent, [first, turned_about(SYMMETRIC, second, 1), third])
+
+    with pytest.raises(CalibrationError, match="'cam2' stands .* turned by 180 degrees about the"):
+        load(session)
+
+
+def test_where_nothing_tells_how_cameras_are_turned_that_is_said_each_time(
+    session: Path,
+    run: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A rig is used all the same, and does not pass its check."""
+    lie_symmetric_board(session, is_textured=False)
+
+    verdicts = [told(load(session))[0] for _ in range(2)]
+    rows = session.parent / "rig.csv"
+    status = run("calibrate", "--check", rows, session, "--rig-unit", "m", "--no-progress")
+
+    assert verdicts == ["open", "open"]
+    assert sum("it cannot be told whether" in one.getMessage() for one in caplog.records) == 2
+    assert status == NOT_GOOD_ENOUGH
+    assert "it cannot be told whether 'cam1' and 'cam2' and 'cam3'" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["detect", "segment", "spacing", "sweep", "render"])
