@@ -1095,8 +1095,9 @@ def _verdict(check: RigCheck, square_m: float, is_scaled: bool) -> str:
         return f"{measured}; {missed}; check the rig's unit, or calibrate again{untested}"
     if check.undecided:
         who = " and ".join(map(repr, check.undecided))
+        stand = "stands" if len(check.undecided) == 1 else "stand"
         return (
-            f"it cannot be told whether {who} stand as the rig says, or turned about the board, "
+            f"it cannot be told whether {who} {stand} as the rig says, or turned about the board, "
             "which looks the same turned: what is seen around it does not say; mark its corners by "
             "hand in one order, move it about, or use one with an odd sum of columns and rows; "
             f"{measured}; {missed}: up to such a turn the rig agrees with the board{untested}"

@@ -132,5 +132,5 @@ def test_a_camera_that_alone_sees_no_scene_is_open_and_the_others_are_told() -> 
     bad = check_rig(turned(cameras, SYMMETRIC, (1, 0, 0, 0)), [SYMMETRIC], blind)
 
     assert (state(good), good.undecided) == ("open", ("cam4",))
-    assert "whether 'cam4' stand" in good.message
+    assert "whether 'cam4' stands as the rig says" in good.message
     assert (state(bad), tuple(bad.turned), bad.undecided) == ("refuted", ("cam1",), ("cam4",))

@@ -313,7 +313,7 @@ def test_a_camera_turned_about_a_board_that_looks_the_same_then_is_refused(sessi
     first, second, third = cameras()
     write_rows(session.parent, [first, turned_about(SYMMETRIC, second, 1), third])
 
-    with pytest.raises(CalibrationError, match="'cam2' stands .* turned by 180 degrees about the"):
+    with pytest.raises(CalibrationError, match=r"'cam2' stands .* turned by 180 degrees about the"):
         load(session)
 
 
