@@ -18,6 +18,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, parameter_names
 from hybridve.calib.pose import invert, transform
 from hybridve.calib.rig import Rig
+from hybridve.calib.twins import find_twins, twins_text
 from hybridve.calib.uncertainty import (
     Noise,
     image_derivatives,
@@ -44,16 +45,14 @@ _SHARE = 0.95
 #: Cells across and down an image in which coverage is counted.
 _CELLS = (8, 6)
 
-#: An image is unsure where its points are known less well than this, in pixels at 95 %, and so many
-#: times less well than in the median of the image.
+#: A parameter of a lens is not determined if points move by more than this (pixels), in the image
+#: or in the working volume but for their outermost `_SHARE`, when it moves by its standard
+#: deviation: outlines are found to a pixel, and what moves them by less changes nothing that is
+#: seen. How well the very corners are known is told by itself.
 _UNSURE_PX = 1.0
-_UNSURE_FACTOR = 3.0
 
 #: Places across and down an image at which that is asked.
 _IMAGE_PLACES = 9
-
-#: A parameter is to blame for an unsure image if knowing it removes this share of the variance.
-_MATTERS = 0.25
 
 #: Points of the volume by which causes are compared.
 _LIMIT_POINTS = 60
@@ -132,8 +131,13 @@ class CameraCertificate:
         at 95 % of the volume; NaN where it sees none of it.
     edge_error95_px : float
         The same for the whole image, at the middle distance of the volume, where it is largest.
+    moved_px : dict of str to float
+        By parameter of its lens how far points move when it moves by its standard deviation, in
+        95 % of the image or of the working volume, whichever is more: by itself, or with what it is
+        tied to, whichever is less. Without those that were given.
     undetermined : tuple of str
-        Parameters of its lens that the pictures do not tell, worst first.
+        Those among them that the pictures do not tell, worst first: points move by more than a
+        pixel.
     """
 
     name: str
@@ -144,6 +148,7 @@ class CameraCertificate:
     turn_std_rad: float
     error95_px: float
     edge_error95_px: float
+    moved_px: dict[str, float]
     undetermined: tuple[str, ...]
 
 
@@ -390,6 +395,7 @@ def _certify_camera(
     errors_px = radius95(pixel_covariance(alone, volume.points_world)[:, 0, :, 0])
     errors_px = errors_px[np.isfinite(errors_px)]
     pixels, edge_px = image_errors(alone, volume)
+    moved_px = _moved_px(alone, pixels, volume)
     has_points = seen is not None and len(seen.pixels) > 0
     return CameraCertificate(
         name=camera.name,
@@ -403,7 +409,12 @@ def _certify_camera(
         turn_std_rad=float(np.sqrt(np.trace(matrix[:3, :3]))),
         error95_px=float(np.quantile(errors_px, _SHARE)) if len(errors_px) else np.nan,
         edge_error95_px=float(np.nanmax(edge_px)) if np.isfinite(edge_px).any() else np.nan,
-        undetermined=_undetermined(alone, pixels, edge_px, volume),
+        moved_px=moved_px,
+        undetermined=tuple(
+            name
+            for name, moved in sorted(moved_px.items(), key=lambda item: -item[1])
+            if moved > _UNSURE_PX
+        ),
     )
 
 
@@ -460,25 +471,37 @@ def _image_points(
     return transform(invert(camera.cam_from_world), rays)
 
 
-def _undetermined(
-    alone: Rig, pixels: NDArray[np.float64], edge_px: NDArray[np.float64], volume: Volume
-) -> tuple[str, ...]:
-    """Return the parameters of a lens whose errors make its image unsure, worst first."""
+def _moved_px(alone: Rig, pixels: NDArray[np.float64], volume: Volume) -> dict[str, float]:
+    """Return how far points move in an image when a parameter of its lens is off by its deviation.
+
+    A parameter is seldom off alone: where a longer focal length is made up for by a camera further
+    away, it moves next to nothing; where the boards were seen in one place, it moves the rest of
+    the volume all the more. Neither makes a parameter undetermined that by itself moves nothing.
+    """
     (camera,) = alone.cameras
     assert alone.covariance is not None
-    known = edge_px[np.isfinite(edge_px)]
-    if not len(known) or known.max() <= max(_UNSURE_PX, _UNSURE_FACTOR * np.median(known)):
-        return ()
-    worst = _image_points(camera, pixels[[int(np.nanargmax(edge_px))]], volume)
-    derivatives = image_derivatives(camera, worst)[1][0]  # (2, 6 + P)
     matrix = alone.covariance.matrix
-    total = float(np.trace(derivatives @ matrix @ derivatives.T))
-    gains = []
+    deviations = np.sqrt(np.diag(matrix))
+    image = image_derivatives(camera, _image_points(camera, pixels, volume))[1]  # (K, 2, 6 + P)
+    space = image_derivatives(camera, volume.points_world)[1]  # (N, 2, 6 + P)
+    moved_px = {}
     for column, name in enumerate(parameter_names(camera.model), start=POSE):
-        left = _if_known(matrix, np.array([column]))
-        gains.append((1.0 - float(np.trace(derivatives @ left @ derivatives.T)) / total, name))
-    gains.sort(key=lambda item: -item[0])
-    return tuple(name for gain, name in gains if gain > _MATTERS)
+        if deviations[column] == 0:
+            continue
+        by_itself = np.zeros(len(matrix))
+        by_itself[column] = deviations[column]
+        tied = matrix[:, column] / deviations[column]
+        moved_px[name] = min(
+            max(_largest(image @ change), _largest(space @ change)) for change in (by_itself, tied)
+        )
+    return moved_px
+
+
+def _largest(moves_px: NDArray[np.float64]) -> float:
+    """Return the length that all moves (N, 2) but the largest keep, of those that are known."""
+    lengths = np.linalg.norm(moves_px, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    return float(np.quantile(lengths, _SHARE)) if len(lengths) else 0.0
 
 
 def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> tuple[str, ...]:
@@ -489,8 +512,8 @@ def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> t
             kind = _kind(told.undetermined[0])
             warnings.append(
                 f"{told.name}: {names} {'is' if len(told.undetermined) == 1 else 'are'} not "
-                f"determined (its image is known to {told.edge_error95_px:.1f} px only where it is "
-                f"known worst): {_ADVICE[kind]}"
+                f"determined (one standard deviation of {told.undetermined[0]} moves what it sees "
+                f"by up to {told.moved_px[told.undetermined[0]]:.1f} px): {_ADVICE[kind]}"
             )
     if noise.share_explained < _LEAST_EXPLAINED and noise.rms_px > _NEGLIGIBLE_PX:
         warnings.append(
@@ -508,6 +531,9 @@ def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> t
 def _doubts(rig: Rig) -> tuple[str, ...]:
     """Return what a calibration found to contradict itself, or could not decide."""
     doubts = list(rig.provenance.get("adjustment", {}).get("warnings", []))
+    # One clip that was given twice counts as two: the errors that are stated are too small.
+    if twins := twins_text(find_twins(rig)):
+        doubts.append(f"{twins}.")
     if rig.provenance.get("labelling", {}).get("is_weak", False):
         doubts.append(
             "the board looks the same when turned, and hardly anything tells which way round each "
@@ -534,7 +560,7 @@ def _verdict(error95_m: float, cameras: Sequence[CameraCertificate], limit: Limi
     verdict = f"good to {millimetres(error95_m)} mm in the working volume (95 %)"
     unsure = [told for told in cameras if told.undetermined]
     if unsure:
-        worst = max(unsure, key=lambda told: told.edge_error95_px)
+        worst = max(unsure, key=lambda told: max(told.moved_px.values()))
         name = worst.undetermined[0]
         return f"{verdict}; {worst.name}'s {name} is not determined: {_ADVICE[_kind(name)]}"
     if limit.error95_m < _BETTER * error95_m:

@@ -9,6 +9,9 @@ agree best, until the rest agrees.
 Where the rig knows its own errors (its covariance), these and the noise of the corners say how
 large a disagreement may be; else fixed tolerances do.
 
+Cameras that agree may still be turned about a board that looks the same when turned
+(`hybridve.calib.turns`). A rig of which that cannot be told is neither trustworthy nor refuted.
+
 This work is based on: Koch, *Parameter estimation and hypothesis testing in linear models*, 2nd
 ed., 1999 (section 4.5, tests for single shifts).
 """
@@ -17,11 +20,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Board, Sighting, is_seen
+from hybridve.calib.board import Board, Observations, Sighting, is_seen
 from hybridve.calib.bundle import POSE
 from hybridve.calib.camera import Camera
 from hybridve.calib.comparison import (
@@ -44,6 +48,8 @@ from hybridve.calib.placement import (
 )
 from hybridve.calib.pose import Pose, angle_between, compose, invert, transform
 from hybridve.calib.rig import Rig
+from hybridve.calib.turns import ListedView, Turned, Turns, judge_turns
+from hybridve.calib.twins import find_twins, twins_text
 
 #: Boards contradict a rig that has no covariance beyond these: the rig's scale by more than 5 %
 #: (independent careful calibrations of one recording differ by up to 4 %), or its corners by more
@@ -57,12 +63,11 @@ ZOOM_TOLERANCE = 0.05
 _ZOOM_SIGMAS = 4.0
 
 #: With a covariance: a rig is accused if what it shows happens in less than this share of rigs
-#: that have not been touched; each camera's part in it alone, or all of it together.
-SIGNIFICANCE = 0.01
-
-#: Where a rig is known to be wrong, the rest of its cameras agree unless this is how rare they are:
-#: what chance does to them must not hide who was moved.
-_REST_SIGNIFICANCE = 1e-4
+#: that have not been touched; each camera's part in it alone, or all of it together. Every rig is
+#: tested in every session that uses it, so that good ones must hardly ever be accused; a camera
+#: moved by 5 mm and 0.3 degrees at 2 m shows by less than 1 in 10^17 all the same. What chance
+#: does to the rest of a rig that is known to be wrong must not hide who was moved, either.
+SIGNIFICANCE = 1e-4
 
 #: The squares of a board are known to this share, by a ruler: a smaller scale is told, not blamed.
 _SQUARES_KNOWN = 0.005
@@ -135,6 +140,10 @@ class Moved:
     p_value: float | None
 
 
+class NotTestableError(CalibrationError):
+    """Nothing was seen by which a rig could be tested: it is neither right nor wrong."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigCheck:
     """What boards say of a rig.
@@ -153,7 +162,10 @@ class RigCheck:
     odd_camera : str or None
         The camera without which the others agree, if it is a single one.
     is_trustworthy : bool
-        Whether scale and cameras are within what is allowed.
+        Whether scale and cameras are known to be within what is allowed.
+    is_refuted : bool
+        Whether they are known not to be. Neither: nothing tells whether cameras of the rig are
+        turned about a board.
     message : str
         The verdict in one line.
     moved : dict of str to Moved
@@ -162,6 +174,15 @@ class RigCheck:
         Cameras of which one, or more, are not as the rig says, but it cannot be told which.
     exchanged : tuple of (str, str), or None
         Two cameras whose pictures are exchanged.
+    turned : dict of str to Turned
+        Cameras that fit the boards, but stand turned about one that looks the same when turned.
+    turned_sides : tuple of tuple of str
+        All of those; or, where it may as well be others of as many cameras, these sides, of which
+        one stands as the rig says.
+    undecided : tuple of str
+        Cameras of which nothing tells whether they stand so.
+    twins : tuple of tuple of str
+        Cameras of the rig at one place with one view, by the group.
     untested : tuple of str
         Cameras of the rig that saw no board together with others.
     p_value : float or None
@@ -178,19 +199,22 @@ class RigCheck:
     rms_px: dict[str, float]
     odd_camera: str | None
     is_trustworthy: bool
+    is_refuted: bool
     message: str
     moved: dict[str, Moved]
     suspects: tuple[str, ...]
     exchanged: tuple[str, str] | None
+    turned: dict[str, Turned]
+    turned_sides: tuple[tuple[str, ...], ...]
+    undecided: tuple[str, ...]
+    twins: tuple[tuple[str, ...], ...]
     untested: tuple[str, ...]
     p_value: float | None
     scale_sigma: float | None
     n_placements: int
 
 
-def check_rig(
-    rig: Rig, boards: Sequence[Board], sightings: Mapping[str, Sequence[Sighting]]
-) -> RigCheck:
+def check_rig(rig: Rig, boards: Sequence[Board], observations: Sequence[Observations]) -> RigCheck:
     """Check a rig against boards that several of its cameras saw at once.
 
     Each board at each moment is placed in the rig's world by position and orientation, all at one
@@ -204,15 +228,18 @@ def check_rig(
         The rig to be checked. Cameras that are mounted on trackers are not tested.
     boards : sequence of Board
         The boards, with their true squares; `Sighting.board` counts them.
-    sightings : mapping of str to sequence of Sighting
-        By camera what it saw of them; what was seen at no common instant is not used.
+    observations : sequence of Observations
+        What cameras saw of them; what was seen at no common instant is not used. Their pictures of
+        a clip in which boards lie still tell whether cameras are turned about one.
 
     Raises
     ------
+    NotTestableError
+        If fewer than two cameras of the rig see a board at once.
     CalibrationError
-        If fewer than two cameras of the rig see a board at once, or a lens cannot have seen what
-        its camera did.
+        If a lens cannot have seen what its camera did.
     """
+    sightings = {seen.name: seen.sightings for seen in observations}
     case = _Case.of(rig, boards, sightings)
     found = case.examine()
     exchanged = None
@@ -222,7 +249,10 @@ def check_rig(
             if other.agrees:
                 found, exchanged = other, (first, second)
                 break
-    return _read_out(found, boards, exchanged)
+    turns = Turns({}, (), ())
+    if found.agrees and exchanged is None:
+        turns = found.case.turns(found.kept.placed, {seen.name: seen for seen in observations})
+    return _read_out(found, boards, exchanged, turns, find_twins(rig))
 
 
 def _exchange(
@@ -231,6 +261,24 @@ def _exchange(
     exchanged = dict(sightings)
     exchanged[first], exchanged[second] = sightings[second], sightings[first]
     return exchanged
+
+
+def check_from_dict(told: Mapping[str, Any]) -> RigCheck:
+    """Return what `dataclasses.asdict` made plain, and JSON may have kept."""
+    pair = told["exchanged"]
+    return RigCheck(
+        **{
+            **told,
+            "moved": {name: Moved(**one) for name, one in told["moved"].items()},
+            "turned": {name: Turned(**one) for name, one in told["turned"].items()},
+            "turned_sides": tuple(tuple(side) for side in told["turned_sides"]),
+            "twins": tuple(tuple(group) for group in told["twins"]),
+            "suspects": tuple(told["suspects"]),
+            "undecided": tuple(told["undecided"]),
+            "untested": tuple(told["untested"]),
+            "exchanged": None if pair is None else (pair[0], pair[1]),
+        }
+    )
 
 
 # --- What was seen ----------------------------------------------------------------------------
@@ -244,6 +292,7 @@ class _View:
     moment: tuple[int, int]  # instant and board
     pixels: NDArray[np.float64]
     cam_from_board: Pose
+    look: int = 0  # in which the list is read that was found
 
 
 def _located(
@@ -341,7 +390,12 @@ def _listed_alike(rig: Rig, views: Sequence[_View], board: Board) -> list[_View]
         if total > best_total + 1e-9:
             best, best_total = looks, total
     return [
-        replace(view, pixels=view.pixels[board.looks[look]], cam_from_board=poses[look])
+        replace(
+            view,
+            pixels=view.pixels[board.looks[look]],
+            cam_from_board=poses[look],
+            look=int(look),
+        )
         for view, poses, look in zip(views, turned, best, strict=True)
     ]
 
@@ -452,7 +506,7 @@ class _Case:
             told = f"{len(seeing)} of its cameras see the board, expected two or more"
             if len(seeing) > 1:
                 told = "no two of its cameras see the board at the same time"
-            raise CalibrationError(
+            raise NotTestableError(
                 f"the rig cannot be checked: {told} (rig: "
                 f"{', '.join(camera.name for camera in rig.cameras)}; board: "
                 f"{', '.join(seeing) or 'none'})"
@@ -689,7 +743,6 @@ class _Case:
         p_alone = {i: chance_of(max(statistic - alone[i], 0.0), POSE) for i in cameras}
         if n_cameras > 2:  # the whole, and each camera: the least of these probabilities
             p_value = min(1.0, 2.0 * p_value, 2.0 * n_cameras * min(p_alone.values()))
-        allowed = SIGNIFICANCE if n_cameras == len(self.names) else _REST_SIGNIFICANCE
         within = all(rms_px[index] <= self.limits_px[index] for index in cameras)
         return _State(
             cameras,
@@ -701,7 +754,7 @@ class _Case:
             p_value,
             whole.log_scale,
             whole.log_scale_sigma,
-            within if covariance is None else p_value >= allowed,
+            within if covariance is None else p_value >= SIGNIFICANCE,
         )
 
     def _apart(self, cameras: tuple[int, ...]) -> _State:
@@ -811,6 +864,17 @@ class _Case:
         if any(found[i][0] < found[best][0] / _EXPLAINS for i in found if i != best):
             return {}
         return {best: found[best][1]}
+
+    def turns(self, placed: Placed, observations: Mapping[str, Observations]) -> Turns:
+        """Return which cameras are turned about a board that looks the same then."""
+        place_of = {moment: number for number, moment in enumerate(self.moments)}
+        camera_of = {name: index for index, name in enumerate(self.names)}
+        views = [
+            ListedView(camera_of[view.camera], place_of[view.moment], view.moment[1], view.look)
+            for view in self.views
+        ]
+        around = {camera_of[name]: seen for name, seen in observations.items() if name in camera_of}
+        return judge_turns(self.boards, placed, views, self.limits_px, around)
 
     # --- Two cameras in each other's place ---
 
@@ -944,7 +1008,11 @@ def _explanation(left_px: Mapping[str, float], n_values: int) -> str:
 
 
 def _read_out(
-    found: _Finding, boards: Sequence[Board], exchanged: tuple[str, str] | None
+    found: _Finding,
+    boards: Sequence[Board],
+    exchanged: tuple[str, str] | None,
+    turns: Turns,
+    twins: tuple[tuple[str, ...], ...],
 ) -> RigCheck:
     case, kept = found.case, found.kept
     names = case.names
@@ -962,16 +1030,22 @@ def _read_out(
     else:
         is_scaled = abs(scale - 1.0) > SCALE_TOLERANCE
     moved = {names[index]: told for index, told in found.moved.items()}
+    is_refuted = not found.agrees or is_scaled or exchanged is not None or bool(turns.turned)
     check = RigCheck(
         scale=scale,
         pair_scales=pair_scales,
         rms_px=rms_px,
         odd_camera=next(iter(moved)) if len(moved) == 1 else None,
-        is_trustworthy=found.agrees and not is_scaled and exchanged is None,
+        is_trustworthy=not is_refuted and not turns.undecided,
+        is_refuted=is_refuted,
         message="",
         moved=moved,
         suspects=tuple(names[index] for index in found.suspects),
         exchanged=exchanged,
+        turned={names[index]: told for index, told in turns.turned.items()},
+        turned_sides=tuple(tuple(names[index] for index in side) for side in turns.sides),
+        undecided=tuple(names[index] for index in turns.undecided),
+        twins=twins,
         untested=found.untested,
         p_value=found.everything.p_value if has_covariance else None,
         scale_sigma=scale * kept.log_scale_sigma if has_covariance else None,
@@ -994,6 +1068,8 @@ def _verdict(check: RigCheck, square_m: float, is_scaled: bool) -> str:
     worst = max(check.rms_px, key=lambda name: check.rms_px[name])
     missed = f"its corners are missed by {check.rms_px[worst]:.1f} px in camera {worst!r}"
     untested = f"; not tested: {', '.join(check.untested)}" if check.untested else ""
+    if check.twins:
+        untested += f"; {twins_text(check.twins)}"
     if check.exchanged is not None:
         first, second = check.exchanged
         return (
@@ -1013,9 +1089,38 @@ def _verdict(check: RigCheck, square_m: float, is_scaled: bool) -> str:
         else:
             which = f"one of {who} stands elsewhere than the rig says, or has another zoom"
         return f"the cameras disagree: {which}; {missed}; {measured}; calibrate again{untested}"
+    if check.turned:
+        return f"{_told_turned(check)}; {measured}; {missed}; calibrate again{untested}"
     if is_scaled:
         return f"{measured}; {missed}; check the rig's unit, or calibrate again{untested}"
+    if check.undecided:
+        who = " and ".join(map(repr, check.undecided))
+        stand = "stands" if len(check.undecided) == 1 else "stand"
+        return (
+            f"it cannot be told whether {who} {stand} as the rig says, or turned about the board, "
+            "which looks the same turned: what is seen around it does not say; mark its corners by "
+            "hand in one order, move it about, or use one with an odd sum of columns and rows; "
+            f"{measured}; {missed}: up to such a turn the rig agrees with the board{untested}"
+        )
     return f"{measured}; {missed}: the rig agrees with the board{untested}"
+
+
+def _told_turned(check: RigCheck) -> str:
+    sides = [" and ".join(map(repr, side)) for side in check.turned_sides]
+    told = list(check.turned.values())
+    angles = " and ".join(f"{angle:.0f}" for angle in sorted({one.turn_deg for one in told}))
+    far_m, sigma = max(one.shift_m for one in told), min(one.sigma for one in told)
+    if len(told) == 1:
+        who, far = f"camera {sides[0]} stands", f"{far_m:.2f} m from where the rig has it"
+    else:
+        either = "either " if len(sides) > 1 else "cameras "
+        who = f"{either}{' or '.join(sides)} stand"
+        far = f"up to {far_m:.2f} m from where the rig has them"
+    return (
+        f"{who} elsewhere than the rig says: turned by {angles} degrees about the board, which "
+        f"looks the same then, {far}; so what is seen around the board shows, by {sigma:.1f} "
+        "standard deviations"
+    )
 
 
 def _told(name: str, moved: Moved) -> str:

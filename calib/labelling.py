@@ -37,11 +37,11 @@ logger = logging.getLogger(__name__)
 _HAND_VOTES = 10.0
 
 #: Evidence below this many standard deviations (of counts of chance matches) is called weak.
-_WEAK_EVIDENCE = 3.0
+WEAK_EVIDENCE = 3.0
 
 #: The scene tells that two pictures are alike, or that one of them is mirrored, from so many
 #: standard deviations on: a rig has a hundred pairs, and matches that err are not independent.
-_CLEAR_EVIDENCE = 5.0
+CLEAR_EVIDENCE = 5.0
 
 #: A picture is called mirrored if so many times more matches agree when it is flipped.
 _CLEAR_FACTOR = 2.0
@@ -151,11 +151,7 @@ def _choose(
     looks = [0] * n_cameras
     hands = [camera.hand_look for camera in seen]
     if n_cameras > 1:
-        votes, matches = _votes_of_scene(scenes)
-        for i, j in combinations(range(n_cameras), 2):
-            hand_i, hand_j = hands[i], hands[j]
-            if hand_i is not None and hand_j is not None:
-                votes[i, j, (hand_j - hand_i) % n_looks] += _HAND_VOTES
+        votes, matches = _votes(scenes, hands)
         chosen = choose_looks(votes)
         looks = list(chosen.looks)
         by_hand = sum(hand is not None for hand in hands) > 1
@@ -167,7 +163,7 @@ def _choose(
                 for camera, margin in zip(cameras, chosen.margins_sigma, strict=True)
             },
             "weakest_sigma": round(chosen.weakest_sigma, 2),
-            "is_weak": chosen.weakest_sigma < _WEAK_EVIDENCE,
+            "is_weak": chosen.weakest_sigma < WEAK_EVIDENCE,
         }
         log = logger.warning if evidence["is_weak"] else logger.info
         log(
@@ -191,8 +187,39 @@ def _choose(
     return [(look + turn) % n_looks for look in looks], evidence
 
 
-def _votes_of_scene(scenes: "_Scenes") -> tuple[NDArray[np.float64], dict[str, list[int]]]:
-    """Count the matches of the scene for each pair of cameras and each look."""
+def votes_for_looks(
+    board: Board, cameras: Sequence[Camera], seen: Sequence[Observations], number: int
+) -> NDArray[np.float64]:
+    """Count what speaks for how much further each camera saw a still board turned than another.
+
+    Parameters
+    ----------
+    board : Board
+        The board.
+    cameras, seen : sequence of Camera, sequence of Observations
+        Cameras in whose clip it lies still, of which the lenses are used, and what they saw.
+    number : int
+        The board's number, as sightings count.
+
+    Returns
+    -------
+    votes : (C, C, L) float64
+        ``votes[i, j, k]``, for i < j: matches of the scene, and corners given by hand, for which
+        camera j saw the board k looks ahead of camera i, both by their own lists of corners.
+
+    Raises
+    ------
+    CalibrationError
+        If a lens cannot have seen the board of its clip.
+    """
+    scenes = _Scenes(board, cameras, seen, number)
+    return _votes(scenes, [camera.hand_look for camera in seen])[0]
+
+
+def _votes(
+    scenes: "_Scenes", hands: Sequence[int | None]
+) -> tuple[NDArray[np.float64], dict[str, list[int]]]:
+    """Count votes for each pair of cameras and each look; return the matches among them, too."""
     cameras, n_looks = scenes.cameras, len(scenes.board.looks)
     votes = np.zeros((len(cameras), len(cameras), n_looks))
     matches = {}
@@ -200,6 +227,9 @@ def _votes_of_scene(scenes: "_Scenes") -> tuple[NDArray[np.float64], dict[str, l
         votes[i, j] = scenes.agreeing(i, j)[:: _QUARTERS // n_looks]
         pair = f"{cameras[i].name} {cameras[j].name}"
         matches[pair] = [int(count) for count in votes[i, j]]
+        hand_i, hand_j = hands[i], hands[j]
+        if hand_i is not None and hand_j is not None:
+            votes[i, j, (hand_j - hand_i) % n_looks] += _HAND_VOTES
     return votes, matches
 
 
@@ -392,7 +422,7 @@ def _refuse_mirrored(
                 continue
             counts = scenes.agreeing(i, j, has_floor=has_floor).tolist()
             agreeing = counts.pop((quarters[j] - quarters[i]) % _QUARTERS)
-            if sigmas_apart(agreeing, max(counts)) > _CLEAR_EVIDENCE:
+            if sigmas_apart(agreeing, max(counts)) > CLEAR_EVIDENCE:
                 groups.join(seeing[i], seeing[j])
             else:
                 unlike.append((i, j))
@@ -408,7 +438,7 @@ def _refuse_mirrored(
         plain, flipped, chance = _compare_flipped(scenes, quarters, pairs)
         rival = max(plain, chance)
         sigmas = sigmas_apart(flipped, rival)
-        if sigmas > _CLEAR_EVIDENCE and flipped > _CLEAR_FACTOR * rival:
+        if sigmas > CLEAR_EVIDENCE and flipped > _CLEAR_FACTOR * rival:
             compared.append(_Mirrored(sigmas, one, other, plain, flipped))
     if compared:
         raise _mirrored_error([camera.name for camera in scenes.cameras], parts, compared)

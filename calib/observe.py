@@ -175,7 +175,7 @@ def find_boards(
     settings: ObserveSettings = _DEFAULTS,
     progress: Progress | None = None,
     cache: CornerCache | None = None,
-) -> dict[str, tuple[Sighting, ...]]:
+) -> list[Observations]:
     """Find the boards where all cameras see them at once, to check a rig made elsewhere.
 
     Parameters
@@ -185,8 +185,8 @@ def find_boards(
 
     Returns
     -------
-    dict of str to tuple of Sighting
-        By camera what its clip shows: one instant, 0, if the boards lie still in it.
+    list of Observations
+        What the clips show, without stills: one instant, 0, if the boards lie still in them.
 
     Raises
     ------
@@ -196,11 +196,11 @@ def find_boards(
     _check_boards(boards)
     seeing = [camera for camera in cameras if camera.extrinsics is not None]
     if not seeing:
-        return {}
+        return []
     with _Search(boards, settings, progress or _no_progress, cache) as search:
         given = {camera.name: _given(boards, camera) for camera in seeing}
         clips = _observe_clips(search, seeing, given)
-    return {camera.name: clip.sightings for camera, clip in zip(seeing, clips, strict=True)}
+    return [_observations(camera, None, clip) for camera, clip in zip(seeing, clips, strict=True)]
 
 
 def _no_progress(what: str, done: int, total: int) -> None:

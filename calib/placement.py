@@ -105,7 +105,7 @@ def residuals_of(views: Views, placed: Placed) -> NDArray[np.float64]:
     for index, camera in enumerate(placed.cameras):
         own = seen & (views.camera == index)[:, None]
         if own.any():
-            residuals[own] = views.pixels[own] - _imaged(camera, points_cam[own])
+            residuals[own] = views.pixels[own] - imaged(camera, points_cam[own])
     return residuals
 
 
@@ -118,7 +118,11 @@ def _points(views: Views, placed: Placed) -> tuple[NDArray[np.float64], NDArray[
     return arms, world @ poses[:, :, :3].transpose(0, 2, 1) + poses[:, None, :, 3]
 
 
-def _imaged(camera: Camera, points_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+def imaged(camera: Camera, points_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where a camera sees points (N, 3) of its own frame: (N, 2) pixels.
+
+    Points behind it, or that its lens sees nowhere, are told far outside the image.
+    """
     pixels = np.full((len(points_cam), 2), -_BEHIND_WIDTHS * camera.width_px)
     ahead = points_cam[:, 2] > 0
     if ahead.any():

@@ -306,11 +306,14 @@ class LooksByVote:
     weakest_sigma : float
         The same for the weakest link: turning any one camera, or one side of the tree of the
         surest pairs.
+    sides : tuple of (frozenset of int, float)
+        All that was turned so, and the margin: each camera, then each side.
     """
 
     looks: tuple[int, ...]
     margins_sigma: tuple[float, ...]
     weakest_sigma: float
+    sides: tuple[tuple[frozenset[int], float], ...]
 
 
 def choose_looks(votes: NDArray[np.float64]) -> LooksByVote:
@@ -347,7 +350,12 @@ def choose_looks(votes: NDArray[np.float64]) -> LooksByVote:
             if _total(votes, turned) > _total(votes, looks):
                 looks, gains = turned, True
     margins = [_margin(votes, looks, side) for side in sides]
-    return LooksByVote(tuple(looks), tuple(margins[:n_cameras]), min(margins))
+    return LooksByVote(
+        tuple(looks),
+        tuple(margins[:n_cameras]),
+        min(margins),
+        tuple((frozenset(side), margin) for side, margin in zip(sides, margins, strict=True)),
+    )
 
 
 def _surest_tree(votes: NDArray[np.float64]) -> list[tuple[int, int]]:

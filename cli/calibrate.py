@@ -88,7 +88,8 @@ class BoxMillimetres(click.ParamType["Box"]):
     type=click.Path(path_type=Path),
     metavar="RIG",
     help="Calibrate nothing: test this rig, of any format, against the boards of SESSION, and name "
-    f"the camera that is wrong. Exit status {NOT_GOOD_ENOUGH} if it does not fit.",
+    f"the camera that is wrong. Exit status {NOT_GOOD_ENOUGH} if it does not fit, or nothing "
+    "tells.",
 )
 @click.option(
     "--rig-unit",
@@ -154,7 +155,8 @@ def _check(
     session: "Session", source: Path, unit: str | None, stages: StageProgress, *, as_json: bool
 ) -> None:
     from hybridve.calib.rig_io import read_any_rig
-    from hybridve.hull.capture.rig import board_sizes, check_session
+    from hybridve.hull.capture.rig import board_sizes
+    from hybridve.hull.capture.rig_check import check_session
 
     names = [camera.name for camera in session.cameras]
     sizes_px = set(board_sizes(session).values())

@@ -69,7 +69,7 @@ def segment(
     check_lengths(loaded, FrameRange())
     digest, clean = None, None
     if not unconfirmed and has_rig(loaded):
-        rig = load_rig(loaded)
+        rig = load_rig(loaded, StageProgress(enabled=progress))
         digest, clean = rig_digest(rig), _cleaner(loaded, rig)
 
     names = [camera.name for camera in loaded.cameras]

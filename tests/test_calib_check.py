@@ -11,7 +11,7 @@ from helpers.boards import HEIGHT_PX, WIDTH_PX, look_at, make_camera, project, r
 from helpers.bundles import BOARD as CALIBRATED
 from helpers.bundles import make_bundle
 
-from hybridve.calib.board import Sighting
+from hybridve.calib.board import Board, Observations, Sighting
 from hybridve.calib.bundle import adjust, moved_pose
 from hybridve.calib.camera import Camera
 from hybridve.calib.check import SCALE_TOLERANCE, SIGNIFICANCE, RigCheck, check_rig
@@ -26,7 +26,7 @@ from hybridve.calib.uncertainty import measure_noise, rig_covariance
 #: Noise-free corners determine the scale to this, and reprojections in pixels.
 EXACT = 1e-6
 
-BOARD = Chessboard(8, 6, 0.1)
+BOARD = Chessboard(8, 7, 0.1)
 
 
 def corners_of(cameras: list[Camera], board: Chessboard = BOARD) -> dict[str, list[Sighting]]:
@@ -39,19 +39,40 @@ def corners_of(cameras: list[Camera], board: Chessboard = BOARD) -> dict[str, li
     return seen
 
 
+def examine(rig: Rig, boards: Sequence[Board], seen: Mapping[str, Sequence[Sighting]]) -> RigCheck:
+    """Check a rig by corners alone: there is no picture of what is around the boards."""
+    size_px = (WIDTH_PX, HEIGHT_PX)
+    is_still = all(one.instant == 0 for sightings in seen.values() for one in sightings)
+    return check_rig(
+        rig,
+        boards,
+        [
+            Observations(name, "PINHOLE", size_px, tuple(sightings), is_still)
+            for name, sightings in seen.items()
+        ],
+    )
+
+
 def scaled(camera: Camera, factor: float) -> Camera:
     pose = camera.cam_from_world.copy()
     pose[:, 3] *= factor
     return replace(camera, cam_from_world=pose)
 
 
-@pytest.mark.parametrize("board", [BOARD, Chessboard(7, 6, 0.1), Chessboard(6, 6, 0.1)])
+@pytest.mark.parametrize(
+    "board", [BOARD, Chessboard(8, 6, 0.1), Chessboard(7, 7, 0.1), Chessboard(6, 6, 0.1)]
+)
 def test_a_true_rig_agrees_with_its_board(board: Chessboard) -> None:
     cameras = ring(board, ["OPENCV", "PINHOLE", "RADIAL"])
 
-    check = check_rig(Rig(tuple(cameras)), [board], corners_of(cameras, board))
+    check = examine(Rig(tuple(cameras)), [board], corners_of(cameras, board))
 
-    assert check.is_trustworthy
+    assert not check.is_refuted
+    # No corner tells whether a camera stands turned about a board that looks the same then.
+    is_told = len(board.looks) == 1
+    assert check.is_trustworthy == is_told
+    assert check.undecided == (() if is_told else ("cam1", "cam2", "cam3"))
+    assert ("cannot be told" in check.message) == (not is_told)
     assert check.scale == pytest.approx(1.0, abs=EXACT)
     assert max(check.rms_px.values()) < EXACT
     assert check.odd_camera is None
@@ -66,7 +87,7 @@ def test_the_rig_may_stand_anywhere_in_its_world() -> None:
         for camera in cameras
     ]
 
-    check = check_rig(Rig(tuple(moved)), [BOARD], corners_of(cameras))
+    check = examine(Rig(tuple(moved)), [BOARD], corners_of(cameras))
 
     assert check.is_trustworthy
     assert check.scale == pytest.approx(1.0, abs=EXACT)
@@ -77,7 +98,7 @@ def test_a_wrong_scale_is_found_and_told(factor: float) -> None:
     cameras = ring(BOARD, ["PINHOLE", "OPENCV", "PINHOLE"])
     rig = Rig(tuple(scaled(camera, factor) for camera in cameras))
 
-    check = check_rig(rig, [BOARD], corners_of(cameras))
+    check = examine(rig, [BOARD], corners_of(cameras))
 
     assert not check.is_trustworthy
     assert check.scale == pytest.approx(factor, rel=EXACT)
@@ -90,7 +111,7 @@ def test_a_scale_within_tolerance_is_told_but_trusted() -> None:
     cameras = ring(BOARD, ["PINHOLE", "PINHOLE"])
     rig = Rig(tuple(scaled(camera, 1 + SCALE_TOLERANCE / 2) for camera in cameras))
 
-    check = check_rig(rig, [BOARD], corners_of(cameras))
+    check = examine(rig, [BOARD], corners_of(cameras))
 
     assert check.is_trustworthy
     assert "scale 1.025" in check.message
@@ -102,7 +123,7 @@ def test_a_camera_that_was_bumped_is_named() -> None:
     bumped = [*cameras]
     bumped[2] = replace(cameras[2], cam_from_world=compose(bump, cameras[2].cam_from_world))
 
-    check = check_rig(Rig(tuple(bumped)), [BOARD], corners_of(cameras))
+    check = examine(Rig(tuple(bumped)), [BOARD], corners_of(cameras))
 
     assert check.odd_camera == "cam3"
     assert not check.is_trustworthy
@@ -117,7 +138,7 @@ def test_two_cameras_that_disagree_are_told_without_blaming_one() -> None:
         replace(cameras[1], cam_from_world=compose(bump, cameras[1].cam_from_world)),
     ]
 
-    check = check_rig(Rig(tuple(bumped)), [BOARD], corners_of(cameras))
+    check = examine(Rig(tuple(bumped)), [BOARD], corners_of(cameras))
 
     assert not check.is_trustworthy
     assert check.odd_camera is None
@@ -130,7 +151,7 @@ def test_cameras_in_one_place_tell_no_scale() -> None:
     turned = moved_pose(first.cam_from_world, np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0]))
     cameras = [first, replace(first, name="cam2", cam_from_world=turned)]
 
-    check = check_rig(Rig(tuple(cameras)), [BOARD], corners_of(cameras))
+    check = examine(Rig(tuple(cameras)), [BOARD], corners_of(cameras))
 
     assert check.is_trustworthy
     assert check.pair_scales == {}
@@ -143,14 +164,14 @@ def test_one_camera_cannot_check_a_rig() -> None:
     del corners["cam2"]
 
     with pytest.raises(CalibrationError, match="1 of its cameras see the board, expected two"):
-        check_rig(Rig(tuple(cameras)), [BOARD], corners)
+        examine(Rig(tuple(cameras)), [BOARD], corners)
 
 
 def test_cameras_that_saw_no_board_are_left_out() -> None:
     cameras = ring(BOARD, ["PINHOLE", "PINHOLE"])
     idle = make_camera("idle", "PINHOLE", look_at((0.0, 0.0, 5.0), (9.0, 0.0, 0.0)))
 
-    check = check_rig(Rig((*cameras, idle)), [BOARD], corners_of(cameras))
+    check = examine(Rig((*cameras, idle)), [BOARD], corners_of(cameras))
 
     assert check.is_trustworthy
     assert set(check.rms_px) == {"cam1", "cam2"}
@@ -226,13 +247,13 @@ def exchanged(
 
 
 def test_an_untouched_rig_is_accused_as_rarely_as_is_said() -> None:
-    """At most SIGNIFICANCE of the rigs: of 15, two or more are accused once in 100 such tests."""
+    """At most SIGNIFICANCE of the rigs: of 15, one is accused once in 600 such tests."""
     checks = [
-        check_rig(calibrated(seed), [CALIBRATED], seen_by(truth(), seed=1000 + seed))
+        examine(calibrated(seed), [CALIBRATED], seen_by(truth(), seed=1000 + seed))
         for seed in range(N_SEEDS)
     ]
 
-    assert sum(not check.is_trustworthy for check in checks) <= 1
+    assert all(check.is_trustworthy for check in checks)
     # The probabilities are not all near one either: some of 15 should be below a half.
     values = [check.p_value for check in checks if check.p_value is not None]
     assert len(values) == N_SEEDS
@@ -246,7 +267,7 @@ def test_a_camera_bumped_by_5_mm_and_a_third_of_a_degree_is_named() -> None:
         index = seed % len(MODELS)
         now = with_one(truth(), index, bumped(truth()[index], seed))
         seen = seen_by(now, n_moments=4, seed=2000 + seed)
-        check = check_rig(calibrated(seed), [CALIBRATED], seen)
+        check = examine(calibrated(seed), [CALIBRATED], seen)
         if check.odd_camera == now[index].name:
             named += 1
             told = check.moved[check.odd_camera]
@@ -282,8 +303,8 @@ def test_a_rig_is_not_accused_of_errors_that_it_states_itself() -> None:
     modest = Rig(tuple(cameras), covariance=replace(rig.covariance, matrix=matrix))
     proud = Rig(tuple(cameras), covariance=rig.covariance)
 
-    assert check_rig(modest, [CALIBRATED], seen).is_trustworthy
-    assert not check_rig(proud, [CALIBRATED], seen).is_trustworthy
+    assert examine(modest, [CALIBRATED], seen).is_trustworthy
+    assert not examine(proud, [CALIBRATED], seen).is_trustworthy
 
 
 def test_several_bumped_cameras_are_named_with_how_far_they_moved() -> None:
@@ -292,7 +313,7 @@ def test_several_bumped_cameras_are_named_with_how_far_they_moved() -> None:
     cameras[1] = bumped(cameras[1], 1, 80.0, 5.0)
     cameras[3] = bumped(cameras[3], 2, 50.0, 3.0)
 
-    check = check_rig(calibrated(0, models), [CALIBRATED], seen_by(cameras, n_moments=3))
+    check = examine(calibrated(0, models), [CALIBRATED], seen_by(cameras, n_moments=3))
 
     assert set(check.moved) == {"cam2", "cam4"}
     assert check.odd_camera is None
@@ -309,7 +330,7 @@ def test_exchanged_cameras_are_named(pair: tuple[str, str], knows_its_errors: bo
     if not knows_its_errors:
         rig = Rig(rig.cameras)
 
-    check = check_rig(rig, [CALIBRATED], exchanged(seen_by(truth()), *pair))
+    check = examine(rig, [CALIBRATED], exchanged(seen_by(truth()), *pair))
 
     assert check.exchanged == pair
     assert not check.is_trustworthy
@@ -319,7 +340,7 @@ def test_exchanged_cameras_are_named(pair: tuple[str, str], knows_its_errors: bo
 def test_two_exchanged_cameras_alone_are_named() -> None:
     rig = calibrated(1).only(["cam1", "cam2"])
 
-    check = check_rig(rig, [CALIBRATED], exchanged(seen_by(truth()[:2]), "cam1", "cam2"))
+    check = examine(rig, [CALIBRATED], exchanged(seen_by(truth()[:2]), "cam1", "cam2"))
 
     assert check.exchanged == ("cam1", "cam2")
 
@@ -334,7 +355,7 @@ def test_a_zoom_is_told_from_a_move(n_cameras: int, knows_its_errors: bool, fact
     cameras = truth()[:n_cameras]
 
     now = with_one(cameras, 1, zoomed(cameras[1], factor))
-    check = check_rig(rig, [CALIBRATED], seen_by(now, n_moments=3))
+    check = examine(rig, [CALIBRATED], seen_by(now, n_moments=3))
 
     assert check.odd_camera == "cam2"
     assert check.moved["cam2"].what == "lens"
@@ -354,8 +375,8 @@ def test_a_scale_beyond_the_stated_errors_is_told() -> None:
     )
     seen = seen_by(truth())
 
-    known = check_rig(larger, [CALIBRATED], seen)
-    unknown = check_rig(Rig(larger.cameras), [CALIBRATED], seen)
+    known = examine(larger, [CALIBRATED], seen)
+    unknown = examine(Rig(larger.cameras), [CALIBRATED], seen)
 
     assert not known.is_trustworthy
     assert not known.moved
@@ -369,8 +390,8 @@ def test_the_order_of_cameras_and_sightings_does_not_matter() -> None:
     now = with_one(truth(), 2, bumped(truth()[2], 4, 20.0, 1.0))
     seen = seen_by(now, n_moments=3)
 
-    forth = check_rig(rig, [CALIBRATED], seen)
-    back = check_rig(
+    forth = examine(rig, [CALIBRATED], seen)
+    back = examine(
         rig.only([camera.name for camera in reversed(rig.cameras)]),
         [CALIBRATED],
         {name: sightings[::-1] for name, sightings in reversed(seen.items())},
@@ -394,7 +415,7 @@ def test_boards_of_several_kinds_are_used_also_where_they_are_seen_in_part() -> 
     for sightings in seen.values():
         assert any(np.isnan(sighting.pixels).any() for sighting in sightings)
 
-    check = check_rig(Rig(tuple(truth())), boards, seen)
+    check = examine(Rig(tuple(truth())), boards, seen)
 
     assert check.is_trustworthy
     assert check.n_placements == 6
@@ -407,7 +428,7 @@ def test_wild_corners_accuse_nobody() -> None:
     for name, sightings in seen.items():
         sightings[1].pixels[3] += (40.0, -25.0) if name == "cam1" else (0.0, 60.0)
 
-    check = check_rig(calibrated(5), [CALIBRATED], seen)
+    check = examine(calibrated(5), [CALIBRATED], seen)
 
     assert check.is_trustworthy, check.message
 
@@ -417,7 +438,7 @@ def test_moments_that_cameras_do_not_share_tell_nothing() -> None:
     seen["cam2"] = [replace(sighting, instant=7) for sighting in seen["cam2"]]
 
     with pytest.raises(CalibrationError, match="no two of its cameras see the board at the same"):
-        check_rig(Rig(tuple(truth()[:2])), [CALIBRATED], seen)
+        examine(Rig(tuple(truth()[:2])), [CALIBRATED], seen)
 
 
 def test_the_chance_of_a_statistic_is_that_of_tables() -> None:

@@ -290,9 +290,10 @@ def test_each_frame_is_looked_at_where_clocks_are_asked_for(
 def test_clips_without_stills_serve_and_checking_needs_no_stills(recorded: Path) -> None:
     found = find_boards([BOARD], inputs(recorded, intrinsics=None), SETTINGS)
 
-    assert find_boards([BOARD], inputs(recorded, extrinsics=None), SETTINGS) == {}
-    for camera in two_cameras():
-        (sighting,) = found[camera.name]
+    assert find_boards([BOARD], inputs(recorded, extrinsics=None), SETTINGS) == []
+    for camera, seen in zip(two_cameras(), found, strict=True):
+        (sighting,) = seen.sightings
+        assert seen.name == camera.name
         expected = project(camera, camera.cam_from_world, BOARD)
         assert np.abs(sighting.pixels - expected).max() < FOUND_PX
 

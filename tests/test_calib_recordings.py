@@ -3,13 +3,15 @@
 import itertools
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.boards import turned_about
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Sighting
+from hybridve.calib.board import Observations
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.check import check_rig
 from hybridve.calib.errors import CalibrationError
@@ -73,7 +75,7 @@ def horseman(horseman_inputs: Callable[[bool], list[CameraInput]]) -> Rig:
 @pytest.fixture(scope="session")
 def board_corners(
     horseman_inputs: Callable[[bool], list[CameraInput]],
-) -> dict[str, tuple[Sighting, ...]]:
+) -> list[Observations]:
     return find_boards([HORSEMAN], horseman_inputs(False), OBSERVE)
 
 
@@ -137,7 +139,7 @@ def test_marks_set_the_world_that_their_reference_has(
     ("name", "unit"), [("reference_a_squares", "squares"), ("reference_b_mm", "mm")]
 )
 def test_both_references_agree_with_the_board_clip(
-    recordings: Path, board_corners: dict[str, tuple[Sighting, ...]], name: str, unit: str
+    recordings: Path, board_corners: list[Observations], name: str, unit: str
 ) -> None:
     rig = import_rig(
         recordings / "horseman",
@@ -155,7 +157,7 @@ def test_both_references_agree_with_the_board_clip(
 
 
 def test_the_third_calibration_is_refused_with_the_scale_it_has(
-    recordings: Path, board_corners: dict[str, tuple[Sighting, ...]]
+    recordings: Path, board_corners: list[Observations]
 ) -> None:
     rig = import_rig(
         recordings / "horseman",
@@ -174,13 +176,57 @@ def test_the_third_calibration_is_refused_with_the_scale_it_has(
 
 
 def test_our_own_rig_agrees_with_the_board_clip(
-    horseman: Rig, board_corners: dict[str, tuple[Sighting, ...]]
+    horseman: Rig, board_corners: list[Observations]
 ) -> None:
     check = check_rig(horseman, [HORSEMAN], board_corners)
 
     assert check.is_trustworthy
     assert check.scale == pytest.approx(1.0, abs=0.002)
     assert max(check.rms_px.values()) < 0.2
+
+
+@pytest.mark.parametrize("turned", [("cam3",), ("cam1", "cam4"), CAMERAS])
+@pytest.mark.parametrize("knows_its_errors", [True, False])
+def test_cameras_turned_about_horsemans_board_are_named(
+    horseman: Rig,
+    board_corners: list[Observations],
+    turned: tuple[str, ...],
+    knows_its_errors: bool,
+) -> None:
+    """The corners do not tell: as far as they go, such a rig agrees to a tenth of a pixel."""
+    rig = Rig(
+        tuple(
+            turned_about(HORSEMAN, camera, 1) if camera.name in turned else camera
+            for camera in horseman.cameras
+        ),
+        covariance=horseman.covariance if knows_its_errors else None,
+    )
+
+    check = check_rig(rig, [HORSEMAN], board_corners)
+
+    assert max(check.rms_px.values()) < 0.2
+    assert not check.undecided
+    assert check.is_refuted == (turned != CAMERAS)  # all of them: another world
+    others = tuple(name for name in CAMERAS if name not in turned)
+    sides = {1: {turned}, 2: {turned, others}, 4: set()}[len(turned)]
+    assert set(check.turned_sides) == sides
+    if turned == ("cam3",):
+        stated, true = (one["cam3"].center_world for one in (rig, horseman))
+        off_m = float(np.linalg.norm(stated - true))
+        assert check.turned["cam3"].shift_m == pytest.approx(off_m, abs=0.02)
+        assert f"{check.turned['cam3'].shift_m:.2f} m" in check.message
+
+
+def test_without_the_scene_nobody_tells_how_horsemans_cameras_are_turned(
+    horseman: Rig, board_corners: list[Observations]
+) -> None:
+    alone = [replace(seen, picture=None) for seen in board_corners]
+
+    check = check_rig(horseman, [HORSEMAN], alone)
+
+    assert not check.is_trustworthy
+    assert not check.is_refuted
+    assert check.undecided == CAMERAS
 
 
 def test_a_camera_of_the_wrong_board_is_named(

@@ -4,24 +4,28 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable
-from dataclasses import asdict
+from itertools import combinations
 
 import numpy as np
 
 from hybridve.calib.account import Calibration
-from hybridve.calib.board import Board
-from hybridve.calib.boards import make_board
 from hybridve.calib.calibrate import calibrate_rig
-from hybridve.calib.check import RigCheck, check_rig
-from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.observe import CameraInput, find_boards
+from hybridve.calib.image_io import FrameSource
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict
 from hybridve.calib.settings import CalibrationSettings
 from hybridve.calib.tracker_io import read_poses
+from hybridve.calib.twins import find_twins, twins_text
 from hybridve.calib.world import Mark
 from hybridve.hull.capture.recording import recording_of
+from hybridve.hull.capture.rig_check import (
+    camera_inputs,
+    corner_cache,
+    examined,
+    remember_made,
+    session_boards,
+)
 from hybridve.hull.capture.session import RigFile, Session
 
 _log = logging.getLogger(__name__)
@@ -65,29 +69,11 @@ def calibrate_session(session: Session, progress: Progress | None = None) -> Cal
         for camera in session.cameras
         if camera.extrinsics_poses is not None
     }
-    return calibrate_rig(
-        boards, _inputs(session), settings, progress, _corner_cache(session), tracks
+    calibration = calibrate_rig(
+        boards, camera_inputs(session.cameras), settings, progress, corner_cache(session), tracks
     )
-
-
-def session_boards(session: Session) -> list[Board]:
-    """Return the boards that a session describes.
-
-    Raises
-    ------
-    CalibrationError
-        If it describes none, or one that cannot be.
-    """
-    if not session.targets:
-        raise CalibrationError(
-            f"{session.path}: has neither a [target] to calibrate with nor a rig made elsewhere; "
-            "describe the board, or name a rig with rig ="
-        )
-    return [make_board(target.table()) for target in session.targets]
-
-
-def _corner_cache(session: Session) -> CornerCache:
-    return CornerCache(session.folder / "rig" / "corners")
+    remember_made(session, calibration.rig)
+    return calibration
 
 
 def has_rig(session: Session) -> bool:
@@ -95,17 +81,29 @@ def has_rig(session: Session) -> bool:
     return session.rig_file is not None or (session.folder / "rig" / "rig.json").is_file()
 
 
-def load_rig(session: Session) -> Rig:
+def load_rig(session: Session, progress: Progress | None = None) -> Rig:
     """Return the session's rig: the one it names, or the one that was calibrated for it.
+
+    Whichever it is, it was tested against the boards that the session's cameras saw, if they saw
+    any (`hybridve.hull.capture.rig_check`); its provenance says so, as "check".
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    progress : callable, optional
+        Told ``(what, done, total)`` while the boards' pictures are searched: the first time a rig
+        is used in a session. Without it, one line is logged where that takes long.
 
     Raises
     ------
     CalibrationError
-        If there is none, or it lacks a camera of the session, or is for images of another size.
+        If there is none, or it lacks a camera of the session, or is for images of another size, or
+        the session's boards refute it.
     """
     sizes_px = _recorded_sizes(session)
     if session.rig_file is not None:
-        rig = _import(session, session.rig_file, sizes_px)
+        rig, label = _import(session, session.rig_file, sizes_px), session.rig_file.pattern
     else:
         path = session.folder / "rig" / "rig.json"
         if not path.is_file():
@@ -113,7 +111,7 @@ def load_rig(session: Session) -> Rig:
                 f"{session.path}: there is no rig at {path}; run `hybridve calibrate "
                 f"{session.path}` first, or name one with rig ="
             )
-        rig = read_rig(path)
+        rig, label = read_rig(path), str(path)
     for name, (width_px, height_px) in sizes_px.items():
         camera = rig[name]
         if (camera.width_px, camera.height_px) != (width_px, height_px):
@@ -121,7 +119,8 @@ def load_rig(session: Session) -> Rig:
                 f"{session.path}: camera {name!r} recorded {width_px}x{height_px}, but its rig is "
                 f"for {camera.width_px}x{camera.height_px}; calibrate it at the size recorded"
             )
-    return rig
+    _tell_twins(session, rig)
+    return examined(session, rig, label, progress)
 
 
 def rig_digest(rig: Rig) -> str:
@@ -137,37 +136,43 @@ def take_elsewhere(session: Session, progress: Progress | None = None) -> Rig:
     Raises
     ------
     CalibrationError
-        If the rig cannot be read, or does not fit the boards that the session's cameras saw.
+        If the rig cannot be read, or the boards that the session's cameras saw refute it.
     """
     assert session.rig_file is not None
+    label = session.rig_file.pattern
     rig = _import(session, session.rig_file, board_sizes(session))
-    seeing = [camera for camera in session.cameras if camera.extrinsics is not None]
-    if session.target is None or len(seeing) < 2:
+    rig = examined(session, rig, label, progress)
+    if rig.provenance["check"]["verdict"] == "no board":
         _log.warning(
             "%s: the rig %r is taken as it is: there is no board in the session to test it against",
             session.path,
-            session.rig_file.pattern,
+            label,
         )
-        return rig
-    check = check_session(session, rig, progress)
-    if not check.is_trustworthy:
-        raise CalibrationError(f"{session.path}: rig {session.rig_file.pattern!r}: {check.message}")
-    return Rig(rig.cameras, {**rig.provenance, "check": asdict(check)}, rig.covariance, rig.mounts)
+    _tell_twins(session, rig)
+    return rig
 
 
-def check_session(session: Session, rig: Rig, progress: Progress | None = None) -> RigCheck:
-    """Test a rig against the boards that a session's cameras saw at once.
+def _tell_twins(session: Session, rig: Rig) -> None:
+    """Log which cameras add nothing to others: by the rig, or because they recorded the same."""
+    told = twins_text(find_twins(rig))
+    if told:
+        _log.warning("%s: %s", session.path, told)
+    for first, second in combinations(session.cameras, 2):
+        if first.recording is not None and _is_same(first.recording, second.recording):
+            _log.warning(
+                "%s: cameras %r and %r have one recording, %s: one of them is not where it was "
+                "made",
+                session.path,
+                first.name,
+                second.name,
+                first.recording.label,
+            )
 
-    Raises
-    ------
-    CalibrationError
-        If no board can be found, or fewer than two cameras of the rig see one.
-    """
-    boards = session_boards(session)
-    sightings = find_boards(
-        boards, _inputs(session), progress=progress, cache=_corner_cache(session)
-    )
-    return check_rig(rig, boards, sightings)
+
+def _is_same(first: FrameSource, second: FrameSource | None) -> bool:
+    return second is not None and [path.resolve() for path in first.paths] == [
+        path.resolve() for path in second.paths
+    ]
 
 
 def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, int]]) -> Rig:
@@ -204,18 +209,3 @@ def board_sizes(session: Session) -> dict[str, tuple[int, int]]:
         height_px, width_px = source.first().shape[:2]
         sizes_px[camera.name] = (width_px, height_px)
     return sizes_px
-
-
-def _inputs(session: Session) -> list[CameraInput]:
-    return [
-        CameraInput(
-            camera.name,
-            camera.model,
-            camera.intrinsics,
-            camera.extrinsics,
-            camera.corners,
-            camera.lens,
-            camera.params,
-        )
-        for camera in session.cameras
-    ]

@@ -275,6 +275,7 @@ class _SessionTable(_Table):
     rig: str | None = None
     rig_unit: RigUnit | None = None
     rig_pixel_centre: float = 0.5
+    rig_check: Literal["on", "off"] = "on"
     point: list[WorldPoint] = []
     mask_threshold: Annotated[int, Field(ge=0, le=254)] = 127
     segmentation: dict[str, Any] = {}
@@ -380,6 +381,9 @@ class Session:
         Whether the clocks of the board clips are as given, or estimated.
     rig_file : RigFile or None
         A calibration made elsewhere.
+    rig_check : str
+        Whether a rig that is used is tested against the boards that the cameras saw: "on", or
+        "off" where it is to be used whatever they say.
     mask_threshold : int
         Pixels of ready masks above it are object pixels.
     segmentation : SegmentSettings
@@ -400,6 +404,7 @@ class Session:
     points: tuple[WorldPoint, ...]
     sync: Literal["given", "estimate"]
     rig_file: RigFile | None
+    rig_check: Literal["on", "off"]
     mask_threshold: int
     segmentation: SegmentSettings
     cameras: tuple[SessionCamera, ...]
@@ -469,6 +474,7 @@ def load_session(path: Path) -> Session:
         points=tuple(parsed.point),
         sync=parsed.sync,
         rig_file=rig_file,
+        rig_check=parsed.rig_check,
         mask_threshold=parsed.mask_threshold,
         segmentation=_segment_settings(parsed.segmentation, path),
         cameras=tuple(
