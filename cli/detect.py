@@ -132,7 +132,8 @@ def detect(
         clashes = _detect_all(sessions, scenes, output, how, let_pass, as_json=as_json)
     else:
         refuse_existing(output, overwrite=overwrite)
-        chain = make_chain(load_session(sessions[0]), load_scene(scenes[0]), settings)
+        told = StageProgress(enabled=progress)
+        chain = make_chain(load_session(sessions[0]), load_scene(scenes[0]), settings, told)
         _write_report(chain, output, how)
         report = read_report(output)
         numbers = summarize(report)
@@ -311,7 +312,7 @@ def _detect_one(session: "Session", scene: "Scene", path: Path, how: _How) -> di
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.summarize import summarize
 
-    chain = make_chain(session, scene, how.settings)
+    chain = make_chain(session, scene, how.settings, StageProgress(enabled=how.progress))
     if how.resume and path.exists() and not how.overwrite:
         found = read_report(path)
         wanted = json.loads(json.dumps([resolved_settings(chain), about_rig(chain)]))

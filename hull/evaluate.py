@@ -178,15 +178,22 @@ def _lens_views(
     )
 
 
-def make_chain(session: Session, scene: Scene, settings: EvaluateSettings) -> Chain:
+def make_chain(
+    session: Session,
+    scene: Scene,
+    settings: EvaluateSettings,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Chain:
     """Return everything that is the same for all frames.
+
+    `progress` is told ``(what, done, total)`` while a rig that was not tested yet is tested.
 
     Raises
     ------
     HybridveError
         If recordings, rig and scene do not fit together.
     """
-    rig = load_rig(session)
+    rig = load_rig(session, progress)
     tracks = read_tracks(session, rig)
     silhouettes = stored_silhouettes(session, rig_digest(rig))
     if silhouettes is None:
@@ -539,6 +546,7 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "unseen": session.unseen,
         "min_cameras": session.min_cameras,
         "mask_threshold": session.mask_threshold,
+        "rig_check": session.rig_check,
         "segmentation": asdict(session.segmentation),
         "silhouettes": None if chain.silhouettes is None else str(chain.silhouettes),
         "local_origin_m": list(local_origin_m(chain)),
