@@ -4,6 +4,7 @@ import base64
 import json
 import struct
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
+from hybridve.hull.contact import readers as readers_module
+from hybridve.hull.contact import step as step_module
 from hybridve.hull.contact.mesh import check_mesh, read_cad
 from hybridve.hull.contact.scene import Scene, load_scene
 
@@ -56,7 +59,8 @@ def scene_of(folder: Path, keys: str) -> Scene:
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n",
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n",
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3 -2 -1\nv 0 1 0\nf -4 -2 -1\n",  # counted where they stand
-        "v 0 0 0 0.5 0.5 0.5\nv 1 0 0 1 1 1\nv 1 1 0 0 0 0\nv 0 1 0 0 0 0\nf 1// 2// 3//\nf 1 3 4",
+        "v 0 0 0 0.5 0.5 0.5\nv 1 0 0 1 1 1\nv 1 1 0 0 0 0\nv 0 1 0 0 0 0\nf 1// 2// 3//\n"
+        "f 1 3 4\n",
         "# a comment\r\nv 0 0 0\r\nv 1 0 0 # there\r\nv 1 1 0\r\nv 0 1 0\r\nf 1/1/1 2/2/2 \\\r\n"
         " 3/3/3 4/4/4 # a square\r\n",
         "mtllib none.mtl\nv\t0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\ng a\nf 1 2 3\ng b\no one\nf 1 3 4\n",
@@ -682,18 +686,36 @@ def test_an_fbx_stands_as_it_was_drawn(tmp_path: Path) -> None:
     np.testing.assert_allclose(thing.box_world, [(10, 20, 30), (11, 21, 31)], atol=1e-5)
     assert thing.is_closed
     assert thing.about["inside_out"] is False
-    with pytest.raises(SceneError, match=r"object\.1\.unit: .*FBX files do not say"):
+    with pytest.raises(SceneError, match=r"object\.1\.unit: .*this FBX file does not say its unit"):
         scene_of(tmp_path, 'mesh = "part.fbx"\n')
 
 
 # --- what holds for all -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("content", ["", "v 0 0 0\nv 1 0 0\n", "solid\nendsolid\n"])
-@pytest.mark.parametrize("suffix", [".obj", ".stl"])
-def test_an_empty_mesh_is_refused(tmp_path: Path, content: str, suffix: str) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [
+        (".obj", ""),
+        (".obj", "v 0 0 0\nv 1 0 0\n"),
+        (".obj", "v 0 0 0\nv 1 0 0\nl 1 2\n"),
+        (".stl", ""),
+        (".stl", "solid\nendsolid\n"),
+        (".stl", b"\0" * 84),
+        (".off", "OFF\n0 0 0\n"),
+        (".ply", PLY.replace("face 2", "face 0").partition("3 0 1 2")[0]),
+    ],
+)
+def test_an_empty_mesh_is_refused(tmp_path: Path, content: str | bytes, suffix: str) -> None:
     with pytest.raises(SceneError, match="the mesh is empty"):
         read_cad(write(tmp_path / f"empty{suffix}", content))
+
+
+def test_a_mesh_without_area_is_refused(tmp_path: Path) -> None:
+    text = "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"
+
+    with pytest.raises(SceneError, match="none of its triangles has an area"):
+        read_cad(write(tmp_path / "line.obj", text))
 
 
 @pytest.mark.parametrize(
@@ -709,7 +731,7 @@ def test_an_empty_mesh_is_refused(tmp_path: Path, content: str, suffix: str) -> 
         ("a.off", "", "cannot be read"),
         ("a.ply", "", "cannot be read"),
         ("a.ply", "ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "cannot be read"),
-        ("a.ply", PLY[: PLY.rindex("3 0")], "cut off: 4 of 5 lines"),
+        ("a.ply", PLY[: PLY.rindex("3 0")], "cut off: 1 of 2 rows of its element 'face'"),
         ("a.off", "OFF 3 2 0\n0 0 0\n1 0 0\n0 1 0 # last\n\n3 0 1 2\n", "cut off: 4 of 5 lines"),
         ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut off: 4 of 5 lines"),
         ("a.stl", binary_stl(np.ones((9, 3, 3)))[:-60], "474 bytes, where its header promises 534"),
@@ -748,11 +770,14 @@ def test_a_face_without_its_vertex_is_refused() -> None:
 def test_a_reader_that_is_not_installed_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "collada", None)
-    monkeypatch.setenv("HYBRIDVE_CACHE", "off")
+    def missing(package: str) -> str:
+        raise PackageNotFoundError(package)
 
-    with pytest.raises(SceneError, match="COLLADA cannot be read without the package collada"):
-        read_cad(write(tmp_path / "part.dae", dae()))
+    for module in (readers_module, step_module):
+        monkeypatch.setattr(module, "version", missing)
+
+    with pytest.raises(SceneError, match="STEP cannot be read without the package cascadio"):
+        read_cad(write(tmp_path / "part.step", step_file(step_box, "mm", (1.0, 2.0, 3.0))))
 
 
 # --- real files -------------------------------------------------------------------------------

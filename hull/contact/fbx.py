@@ -168,10 +168,16 @@ class _Document:
     def _part(self, number: int, world_from_model: NDArray[np.float64]) -> Part:
         model = self._objects[number]
         found = _properties(model, self._defaults.get("Model"))
+        turn = _vector(found, "GeometricRotation")
+        if np.count_nonzero(turn) > 1 and (found.get("RotationOrder") or [0])[0]:
+            raise ValueError(
+                f"model {_name(model)!r} has a geometric rotation and a rotation order, which "
+                "programs read differently; apply its rotation and export it again"
+            )
         matrix = (
             world_from_model
             @ _shift(_vector(found, "GeometricTranslation"))
-            @ _rotation(_vector(found, "GeometricRotation"), "xyz")
+            @ _rotation(turn, "xyz")
             @ _stretch(_vector(found, "GeometricScaling", 1.0))
         )
         pieces, cuts = [], Cuts()

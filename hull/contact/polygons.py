@@ -160,12 +160,13 @@ def _cut_alike(
     exponents = np.frexp(reach)[1]
     scaled = np.ldexp(points[usable], -exponents[:, None, None])
     edges = scaled - scaled[:, :1]
-    normals = np.cross(edges, np.roll(edges, -1, axis=1)).sum(axis=1)  # (P, 3), twice the area
+    crosses = np.cross(edges, np.roll(edges, -1, axis=1))
+    normals = crosses.sum(axis=1)  # (P, 3), twice the area
     lengths = np.linalg.norm(normals, axis=1)
     along = np.einsum("pnk,pk->pn", edges, normals / np.where(lengths > 0, lengths, 1.0)[:, None])
     bent = np.ptp(along, axis=1)
     largest = np.ldexp(reach, -exponents)
-    flat = look_along(scaled, normals)
+    flat = look_along(scaled, crosses)
     a, b, c = (flat[:, fan[:, corner]] for corner in range(3))
     well: NDArray[np.bool_] = np.all(turns(a, b, c) >= 0, axis=1)
     if n == 4 and not well.all():
@@ -193,20 +194,25 @@ def _cut_alike(
     )
 
 
-def look_along(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return polygons (P, n, 3) as seen against their normals (P, 3), along an axis: (P, n, 2).
+def look_along(points: NDArray[np.float64], crosses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return polygons (P, n, 3) as seen against their normals, along an axis: (P, n, 2).
 
-    Their coordinates stay what they are; polygons come out counter-clockwise.
+    Their coordinates stay what they are; polygons come out counter-clockwise. Given are the cross
+    products (P, n, 3) of the edges of a fan, whose sum is the normal. Where they cancel each other,
+    as in a bow tie, the axis is that of most of them.
     """
-    axes = np.argmax(np.abs(normals), axis=1)
+    normals, sizes = crosses.sum(axis=1), np.abs(crosses).sum(axis=1)
+    cancels = np.linalg.norm(normals, axis=1) < 1e-3 * np.linalg.norm(sizes, axis=1)
+    axes = np.argmax(np.where(cancels[:, None], sizes, np.abs(normals)), axis=1)
     turned_over = np.take_along_axis(normals, axes[:, None], axis=1)[:, 0] < 0
     first, second = (axes + 1) % 3, (axes + 2) % 3
     columns = np.where(
-        turned_over[:, None], np.stack([second, first], 1), np.stack([first, second], 1)
+        turned_over[:, None],
+        np.stack([second, first], axis=1),
+        np.stack([first, second], axis=1),
     )
-    return np.take_along_axis(
-        points, np.broadcast_to(columns[:, None], (*points.shape[:2], 2)), axis=2
-    )
+    every = np.broadcast_to(columns[:, None], (*points.shape[:2], 2))
+    return np.take_along_axis(points, every, axis=2)
 
 
 def turns(
@@ -374,8 +380,7 @@ def cut_holes_open(outline: NDArray[np.float64], holes: Sequence[NDArray[np.floa
     reach = float(np.abs(points).max())
     scaled = np.ldexp(points, -int(np.frexp(reach)[1]))[None]
     edges = scaled[:, : len(outline)] - scaled[:, :1]
-    normal = np.cross(edges, np.roll(edges, -1, axis=1)).sum(axis=1)
-    flat = look_along(scaled, normal)[0]
+    flat = look_along(scaled, np.cross(edges, np.roll(edges, -1, axis=1)))[0]
     chain = list(range(len(outline)))
     rings = []
     start = len(outline)
