@@ -177,21 +177,22 @@ def _parse(
 def _refuse_what_may_be_cut_off(
     path: Path, contents: Contents, topologies: tuple[Topology, ...]
 ) -> None:
-    """Refuse a text whose last line does not end, unless all its surfaces are closed.
+    """Refuse a text whose last line does not end, unless none of its surfaces has an open edge.
 
     A face at its end may lack digits or corners then. Files that are whole and lack a line end are
-    common, too; what is closed lacks nothing.
+    common, too; what has no open edge lacks nothing.
     """
-    if not contents.is_ended and not all(topology.closed for topology in topologies):
+    has_open_edges = any(t.n_open_edges and not t.closed for t in topologies)
+    if not contents.is_ended and has_open_edges:
         raise SceneError(
-            f"{path}: its last line does not end and its surface is not closed, as if it were cut "
+            f"{path}: its last line does not end and its surface has open edges, as if it were cut "
             "off; if it is whole, end its last line"
         )
 
 
 def _open_without_count(kind: str, topologies: tuple[Topology, ...]) -> tuple[str, ...]:
     """Return a sentence on what cannot be known of a file that does not count its faces."""
-    n_open = sum(topology.n_open_edges for topology in topologies)
+    n_open = sum(topology.n_open_edges for topology in topologies if not topology.closed)
     if kind != "OBJ" or not n_open:
         return ()
     return (
