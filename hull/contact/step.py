@@ -7,7 +7,9 @@ is asked for half, and each part is measured both ways against itself at a quart
 and of that angle; if it is still not as close as it should be, once more finer. What is measured is
 an *estimate*, not a bound: distances are taken at many points, and from triangles too, not from the
 surface itself. The distance of those from the surface is a third of what is measured, if
-OpenCASCADE is as far off in both as their tolerances are apart; that third is added.
+OpenCASCADE is as far off in both as their tolerances are apart; that third is added. A part that
+had to be made finer counts as half as far off as it was before at least: on faces whose edges do
+not lie on them, triangles come no closer however fine they are, and differ less than they are off.
 
 OpenCASCADE leaves out what it cannot understand, now and then without a word: a damaged face, a
 part without geometry. So a file is refused that names what is not in it, of which a part came out
@@ -81,7 +83,7 @@ def parse_step(content: bytes, tessellation_m: float) -> Contents:
         asked_m, angle_rad = share * tessellation_m, angle_share * ANGLE_RAD
         merged = [(asked_m, angle_rad, True), (asked_m / _FINER, angle_rad / _FINER, True)]
         found, finer = (_parts(glb) for glb in _convert(content, merged))
-        parts = _measured(found, finer)
+        parts = _not_much_better(_measured(found, finer), parts)
         worst = max((part.off_by_m for part in parts), default=0.0)
         if worst <= tessellation_m:
             break
@@ -207,6 +209,20 @@ def _measured(parts: tuple[Part, ...], finer: tuple[Part, ...]) -> tuple[Part, .
     return tuple(
         dataclasses.replace(part, off_by_m=_off_by(part, other))
         for part, other in zip(parts, finer, strict=True)
+    )
+
+
+def _not_much_better(parts: tuple[Part, ...], before: tuple[Part, ...]) -> tuple[Part, ...]:
+    """Return parts that are at least half as far off as they were before they were made finer."""
+    if not before:
+        return parts
+    if len(parts) == len(before):
+        least = [part.off_by_m / 2 for part in before]
+    else:
+        least = [max(part.off_by_m for part in before) / 2] * len(parts)
+    return tuple(
+        dataclasses.replace(part, off_by_m=max(part.off_by_m, off_by_m))
+        for part, off_by_m in zip(parts, least, strict=True)
     )
 
 
