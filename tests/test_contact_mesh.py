@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SceneError
 from hybridve.hull.contact import readers as readers_module
 from hybridve.hull.contact import step as step_module
+from hybridve.hull.contact.gltf import parse_gltf
 from hybridve.hull.contact.mesh import check_mesh, read_cad
 from hybridve.hull.contact.scene import Scene, load_scene
 
@@ -408,6 +409,16 @@ def put(**more: Any) -> Callable[[Gltf], None]:
         (lambda gltf: gltf.document["accessors"][0].update(count=3), "names vertex 3 of 3"),
         (lambda gltf: gltf.document["accessors"][0].update(count=-1), "reaches beyond"),
         (lambda gltf: gltf.document["meshes"][0].update(primitives=[]), "mesh is empty"),
+        (lambda gltf: gltf.document["meshes"][0]["primitives"][0].update(mode=7), "of mode 7"),
+        (
+            lambda gltf: gltf.document["meshes"][0].update(weights=[1.0, 2.0]),
+            "2 weights for 0 morph targets",
+        ),
+        (
+            # What waits for a decoder: a buffer without numbers, although the file has some.
+            lambda gltf: [view.update(buffer=1) for view in gltf.document["bufferViews"]],
+            "sound glTF 2.0 file: list index out of range",
+        ),
     ],
 )
 def test_a_gltf_that_cannot_be_read_is_refused(
@@ -424,6 +435,57 @@ def test_a_gltf_that_cannot_be_read_is_refused(
 
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("where", ["mesh", "node"])
+def test_morph_targets_count_with_their_weights(tmp_path: Path, where: str) -> None:
+    gltf = Gltf()
+    corners_ = gltf.accessor(SQUARE.astype("<f4"))
+    up, right = (np.tile(step, (4, 1)).astype("<f4") for step in ([0.0, 0, 1], [1.0, 0, 0]))
+    targets = [{"POSITION": gltf.accessor(up)}, {"NORMAL": 0}, {"POSITION": gltf.accessor(right)}]
+    gltf.mesh(corners_, gltf.accessor(np.array([0, 1, 2, 0, 2, 3], "<u2")), targets=targets)
+    gltf.document["meshes"][0]["weights"] = [9.0, 9.0, 9.0] if where == "node" else [2.0, 1.0, 0.5]
+    if where == "node":
+        gltf.document["nodes"][0]["weights"] = [2.0, 1.0, 0.5]
+
+    found = corners(write(tmp_path / "part.glb", gltf.glb()))
+
+    np.testing.assert_array_equal(found, np.array(TWO_TRIANGLES) + np.array([0.5, 0, 2]))
+
+
+def test_a_buffer_that_waits_for_a_decoder_is_refused(tmp_path: Path) -> None:
+    gltf = square_gltf()
+    content = gltf.glb()
+    gltf.document["buffers"].append({"byteLength": len(gltf.numbers)})
+    for view in gltf.document["bufferViews"]:
+        view["buffer"] = 1
+    text = json.dumps(gltf.document).encode()
+    text += b" " * (-len(text) % 4)
+    numbers = content[20 + struct.unpack_from("<I", content, 12)[0] :]
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(numbers), len(text), b"JSON")
+
+    with pytest.raises(SceneError, match="buffer 1 has no numbers: they are compressed"):
+        read_cad(write(tmp_path / "part.glb", head + text + numbers))
+
+
+def test_meshes_outside_the_scene_are_said(tmp_path: Path) -> None:
+    gltf = square_gltf()
+    gltf.document["nodes"].append({"mesh": 0, "name": "hidden"})
+
+    cad = read_cad(write(tmp_path / "part.glb", gltf.glb()))
+
+    assert cad.notes == ("1 nodes with meshes are not in its scene, first 'hidden'",)
+    assert len(cad.parts) == 1
+
+
+def test_a_glb_cut_off_anywhere_is_refused_and_so_is_more(tmp_path: Path) -> None:
+    content = square_gltf().glb()
+
+    for end in range(len(content)):
+        with pytest.raises(ValueError, match=r"cut off|JSON"):
+            parse_gltf(content[:end], {})
+    with pytest.raises(ValueError, match="bytes, where its header promises"):
+        parse_gltf(content + b"more", {})
 
 
 # --- COLLADA ----------------------------------------------------------------------------------

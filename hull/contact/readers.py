@@ -82,10 +82,6 @@ def parse(
     ImportError
         If the library that reads it is not there.
     """
-    if kind == "OBJ":
-        return parse_obj(content, beside)
-    if kind in ("GLB", "glTF"):
-        return parse_gltf(content, beside)
     if kind == "STEP":
         return parse_step(content, tessellation_m)
     alone = {
@@ -95,7 +91,15 @@ def parse(
         "COLLADA": parse_collada,
         "FBX": parse_fbx,
     }
-    return alone[kind](content)
+    try:
+        if kind == "OBJ":
+            return parse_obj(content, beside)
+        if kind in ("GLB", "glTF"):
+            return parse_gltf(content, beside)
+        return alone[kind](content)
+    except (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError) as error:
+        # A value of another kind than belongs there, or too large a number: damage has many forms.
+        raise ValueError(f"not a sound {kind} file: {type(error).__name__}: {error}") from error
 
 
 def leans_on(content: bytes, kind: str) -> list[str]:

@@ -228,7 +228,8 @@ def test_bytes_that_change_never_crash_a_reader(
     path.write_bytes(bytes(content))
 
     try:
-        cad = read_cad(path)
+        with np.errstate(over="ignore"):  # areas of coordinates such as 1e200
+            cad = read_cad(path)
     except SceneError as error:
         assert "\n" not in str(error)  # noqa: PT017
     else:
