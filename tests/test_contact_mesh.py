@@ -4,6 +4,7 @@ import base64
 import json
 import struct
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
+from hybridve.hull.contact import readers as readers_module
+from hybridve.hull.contact import step as step_module
+from hybridve.hull.contact.gltf import parse_gltf
 from hybridve.hull.contact.mesh import check_mesh, read_cad
 from hybridve.hull.contact.scene import Scene, load_scene
 
@@ -56,7 +60,8 @@ def scene_of(folder: Path, keys: str) -> Scene:
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n",
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n",
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3 -2 -1\nv 0 1 0\nf -4 -2 -1\n",  # counted where they stand
-        "v 0 0 0 0.5 0.5 0.5\nv 1 0 0 1 1 1\nv 1 1 0 0 0 0\nv 0 1 0 0 0 0\nf 1// 2// 3//\nf 1 3 4",
+        "v 0 0 0 0.5 0.5 0.5\nv 1 0 0 1 1 1\nv 1 1 0 0 0 0\nv 0 1 0 0 0 0\nf 1// 2// 3//\n"
+        "f 1 3 4\n",
         "# a comment\r\nv 0 0 0\r\nv 1 0 0 # there\r\nv 1 1 0\r\nv 0 1 0\r\nf 1/1/1 2/2/2 \\\r\n"
         " 3/3/3 4/4/4 # a square\r\n",
         "mtllib none.mtl\nv\t0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\ng a\nf 1 2 3\ng b\no one\nf 1 3 4\n",
@@ -404,6 +409,16 @@ def put(**more: Any) -> Callable[[Gltf], None]:
         (lambda gltf: gltf.document["accessors"][0].update(count=3), "names vertex 3 of 3"),
         (lambda gltf: gltf.document["accessors"][0].update(count=-1), "reaches beyond"),
         (lambda gltf: gltf.document["meshes"][0].update(primitives=[]), "mesh is empty"),
+        (lambda gltf: gltf.document["meshes"][0]["primitives"][0].update(mode=7), "of mode 7"),
+        (
+            lambda gltf: gltf.document["meshes"][0].update(weights=[1.0, 2.0]),
+            "2 weights for 0 morph targets",
+        ),
+        (
+            # What waits for a decoder: a buffer without numbers, although the file has some.
+            lambda gltf: [view.update(buffer=1) for view in gltf.document["bufferViews"]],
+            "sound glTF 2.0 file: list index out of range",
+        ),
     ],
 )
 def test_a_gltf_that_cannot_be_read_is_refused(
@@ -420,6 +435,57 @@ def test_a_gltf_that_cannot_be_read_is_refused(
 
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("where", ["mesh", "node"])
+def test_morph_targets_count_with_their_weights(tmp_path: Path, where: str) -> None:
+    gltf = Gltf()
+    corners_ = gltf.accessor(SQUARE.astype("<f4"))
+    up, right = (np.tile(step, (4, 1)).astype("<f4") for step in ([0.0, 0, 1], [1.0, 0, 0]))
+    targets = [{"POSITION": gltf.accessor(up)}, {"NORMAL": 0}, {"POSITION": gltf.accessor(right)}]
+    gltf.mesh(corners_, gltf.accessor(np.array([0, 1, 2, 0, 2, 3], "<u2")), targets=targets)
+    gltf.document["meshes"][0]["weights"] = [9.0, 9.0, 9.0] if where == "node" else [2.0, 1.0, 0.5]
+    if where == "node":
+        gltf.document["nodes"][0]["weights"] = [2.0, 1.0, 0.5]
+
+    found = corners(write(tmp_path / "part.glb", gltf.glb()))
+
+    np.testing.assert_array_equal(found, np.array(TWO_TRIANGLES) + np.array([0.5, 0, 2]))
+
+
+def test_a_buffer_that_waits_for_a_decoder_is_refused(tmp_path: Path) -> None:
+    gltf = square_gltf()
+    content = gltf.glb()
+    gltf.document["buffers"].append({"byteLength": len(gltf.numbers)})
+    for view in gltf.document["bufferViews"]:
+        view["buffer"] = 1
+    text = json.dumps(gltf.document).encode()
+    text += b" " * (-len(text) % 4)
+    numbers = content[20 + struct.unpack_from("<I", content, 12)[0] :]
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(numbers), len(text), b"JSON")
+
+    with pytest.raises(SceneError, match="buffer 1 has no numbers: they are compressed"):
+        read_cad(write(tmp_path / "part.glb", head + text + numbers))
+
+
+def test_meshes_outside_the_scene_are_said(tmp_path: Path) -> None:
+    gltf = square_gltf()
+    gltf.document["nodes"].append({"mesh": 0, "name": "hidden"})
+
+    cad = read_cad(write(tmp_path / "part.glb", gltf.glb()))
+
+    assert cad.notes == ("1 nodes with meshes are not in its scene, first 'hidden'",)
+    assert len(cad.parts) == 1
+
+
+def test_a_glb_cut_off_anywhere_is_refused_and_so_is_more(tmp_path: Path) -> None:
+    content = square_gltf().glb()
+
+    for end in range(len(content)):
+        with pytest.raises(ValueError, match=r"cut off|JSON"):
+            parse_gltf(content[:end], {})
+    with pytest.raises(ValueError, match="bytes, where its header promises"):
+        parse_gltf(content + b"more", {})
 
 
 # --- COLLADA ----------------------------------------------------------------------------------
@@ -682,18 +748,36 @@ def test_an_fbx_stands_as_it_was_drawn(tmp_path: Path) -> None:
     np.testing.assert_allclose(thing.box_world, [(10, 20, 30), (11, 21, 31)], atol=1e-5)
     assert thing.is_closed
     assert thing.about["inside_out"] is False
-    with pytest.raises(SceneError, match=r"object\.1\.unit: .*FBX files do not say"):
+    with pytest.raises(SceneError, match=r"object\.1\.unit: .*this FBX file does not say its unit"):
         scene_of(tmp_path, 'mesh = "part.fbx"\n')
 
 
 # --- what holds for all -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("content", ["", "v 0 0 0\nv 1 0 0\n", "solid\nendsolid\n"])
-@pytest.mark.parametrize("suffix", [".obj", ".stl"])
-def test_an_empty_mesh_is_refused(tmp_path: Path, content: str, suffix: str) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [
+        (".obj", ""),
+        (".obj", "v 0 0 0\nv 1 0 0\n"),
+        (".obj", "v 0 0 0\nv 1 0 0\nl 1 2\n"),
+        (".stl", ""),
+        (".stl", "solid\nendsolid\n"),
+        (".stl", b"\0" * 84),
+        (".off", "OFF\n0 0 0\n"),
+        (".ply", PLY.replace("face 2", "face 0").partition("3 0 1 2")[0]),
+    ],
+)
+def test_an_empty_mesh_is_refused(tmp_path: Path, content: str | bytes, suffix: str) -> None:
     with pytest.raises(SceneError, match="the mesh is empty"):
         read_cad(write(tmp_path / f"empty{suffix}", content))
+
+
+def test_a_mesh_without_area_is_refused(tmp_path: Path) -> None:
+    text = "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"
+
+    with pytest.raises(SceneError, match="none of its triangles has an area"):
+        read_cad(write(tmp_path / "line.obj", text))
 
 
 @pytest.mark.parametrize(
@@ -709,7 +793,7 @@ def test_an_empty_mesh_is_refused(tmp_path: Path, content: str, suffix: str) -> 
         ("a.off", "", "cannot be read"),
         ("a.ply", "", "cannot be read"),
         ("a.ply", "ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "cannot be read"),
-        ("a.ply", PLY[: PLY.rindex("3 0")], "cut off: 4 of 5 lines"),
+        ("a.ply", PLY[: PLY.rindex("3 0")], "cut off: 1 of 2 rows of its element 'face'"),
         ("a.off", "OFF 3 2 0\n0 0 0\n1 0 0\n0 1 0 # last\n\n3 0 1 2\n", "cut off: 4 of 5 lines"),
         ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut off: 4 of 5 lines"),
         ("a.stl", binary_stl(np.ones((9, 3, 3)))[:-60], "474 bytes, where its header promises 534"),
@@ -748,11 +832,14 @@ def test_a_face_without_its_vertex_is_refused() -> None:
 def test_a_reader_that_is_not_installed_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "collada", None)
-    monkeypatch.setenv("HYBRIDVE_CACHE", "off")
+    def missing(package: str) -> str:
+        raise PackageNotFoundError(package)
 
-    with pytest.raises(SceneError, match="COLLADA cannot be read without the package collada"):
-        read_cad(write(tmp_path / "part.dae", dae()))
+    for module in (readers_module, step_module):
+        monkeypatch.setattr(module, "version", missing)
+
+    with pytest.raises(SceneError, match="STEP cannot be read without the package cascadio"):
+        read_cad(write(tmp_path / "part.step", step_file(step_box, "mm", (1.0, 2.0, 3.0))))
 
 
 # --- real files -------------------------------------------------------------------------------

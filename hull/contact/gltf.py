@@ -2,8 +2,10 @@
 
 Read here, with NumPy, because what an assembly needs is lost or wrong by way of trimesh 5.2:
 sparse and normalised accessors come out as zeros or unscaled, triangle fans are left out, nodes of
-several primitives get names that differ in every run, and colours need one more library. Whatever
-would be guessed is refused by name instead: compressed meshes, skins, instances on the GPU.
+several primitives get names that differ in every run, and colours need one more library. Morph
+targets count with the weights that the file gives. Whatever would be guessed is refused by name
+instead: compressed meshes, skins, instances on the GPU. Meshes that the scene does not show are
+left out, and said to be.
 
 References
 ----------
@@ -22,11 +24,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.part import Contents, Part, join_meshes, move
+from hybridve.hull.contact.part import (
+    Contents,
+    Part,
+    fan_triangles,
+    join_meshes,
+    move,
+    strip_triangles,
+)
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_NO_SURFACE = (0, 1, 2, 3)  # points and lines
 
 #: Required extensions that leave the triangles what they are.
 _HARMLESS = (
@@ -65,10 +75,12 @@ def parse_gltf(
             reader.part(node, matrix, name_by_mesh=name_by_mesh)
             for node, matrix in _placed_nodes(document)
         ]
+        notes = _what_is_not_shown(document)
     except (KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
         what = f"no {error} where one belongs" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"not a sound glTF 2.0 file: {what}") from error
-    return Contents(tuple(part for part in parts if len(part.faces)), "m", 1.0, "y")
+    filled = tuple(part for part in parts if len(part.faces))
+    return Contents(filled, "m", 1.0, "y", notes=notes)
 
 
 def buffer_names(content: bytes) -> list[str]:
@@ -98,6 +110,8 @@ def _split(content: bytes) -> tuple[dict[str, Any], bytes]:
             raise ValueError(f"glTF version {container}; version 2 can be read")
         if length > len(content):
             raise ValueError(f"the file is cut off: {len(content)} of {length} bytes are there")
+        if content[length:].strip(b"\0\r\n\t "):
+            raise ValueError(f"{len(content)} bytes, where its header promises {length}")
         if json_kind != b"JSON":
             raise ValueError("the file does not begin with its JSON chunk")
         text = content[20 : 20 + json_length]
@@ -152,6 +166,20 @@ def _placed_nodes(
         )
 
 
+def _what_is_not_shown(document: dict[str, Any]) -> tuple[str, ...]:
+    """Return a sentence on nodes with meshes that the scene does not hold, if there are any."""
+    nodes = document.get("nodes", [])
+    shown = {id(node) for node, _ in _placed_nodes(document)}
+    hidden = [
+        str(node.get("name", number))
+        for number, node in enumerate(nodes)
+        if "mesh" in node and id(node) not in shown
+    ]
+    if not hidden:
+        return ()
+    return (f"{len(hidden)} nodes with meshes are not in its scene, first {hidden[0]!r}",)
+
+
 def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # column by column
@@ -188,13 +216,19 @@ class _Reader:
         mesh = self._document["meshes"][node["mesh"]]
         pieces, made_of = [], []
         for primitive in mesh["primitives"]:
-            if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
-                continue  # points and lines have no surface
-            vertices = self._accessor(primitive["attributes"]["POSITION"])
+            mode = primitive.get("mode", _TRIANGLES)
+            if mode in _NO_SURFACE:
+                continue
+            if mode not in (_TRIANGLES, _STRIP, _FAN):
+                raise ValueError(f"a primitive of mode {mode!r}, which is none of glTF 2.0")
+            vertices = self._accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
             faces = self._faces(primitive, len(vertices))
             if len(faces) == 0:
                 continue
-            pieces.append(move(vertices.astype(np.float64), faces, matrix))
+            vertices = self._morph(
+                vertices, primitive, node.get("weights", mesh.get("weights", []))
+            )
+            pieces.append(move(vertices, faces, matrix))
             made_of.append(primitive.get("material"))
         names = [node.get("name"), mesh.get("name")]
         name = next((str(name) for name in names[:: -1 if name_by_mesh else 1] if name), "")
@@ -212,17 +246,25 @@ class _Reader:
         if len(corners) and corners.max() >= n_vertices:
             raise ValueError(f"a face names vertex {corners.max()} of {n_vertices}")
         mode = primitive.get("mode", _TRIANGLES)
-        if mode == _TRIANGLES:
-            if len(corners) % 3:
-                raise ValueError(f"{len(corners)} corners do not make triangles")
-            faces = corners.reshape(-1, 3)
-        elif mode == _STRIP:
-            faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-            faces[1::2] = faces[1::2][:, [0, 2, 1]]  # every other one would be the other way round
-        else:
-            hub = np.full(max(len(corners) - 2, 0), corners[0] if len(corners) else 0)
-            faces = np.stack([corners[1:-1], corners[2:], hub], axis=1)
-        return faces.astype(np.int32)
+        if mode == _STRIP:
+            return strip_triangles(corners)
+        if mode == _FAN:
+            return fan_triangles(corners)
+        if len(corners) % 3:
+            raise ValueError(f"{len(corners)} corners do not make triangles")
+        return corners.reshape(-1, 3).astype(np.int32)
+
+    def _morph(
+        self, vertices: NDArray[np.float64], primitive: dict[str, Any], weights: list[float]
+    ) -> NDArray[np.float64]:
+        """Return vertices moved to the shape that the weights of a node or mesh stand for."""
+        targets = primitive.get("targets", [])
+        if weights and len(weights) != len(targets):
+            raise ValueError(f"{len(weights)} weights for {len(targets)} morph targets")
+        for target, weight in zip(targets, weights, strict=False):
+            if weight and "POSITION" in target:
+                vertices = vertices + weight * self._accessor(target["POSITION"])
+        return vertices
 
     def _accessor(self, number: int) -> NDArray[Any]:
         """Return the rows of an accessor."""
@@ -274,7 +316,8 @@ def _buffer(
 ) -> bytes:
     uri = buffer.get("uri")
     if uri is None:
-        content = binary
+        # Only the first may be the file's own; a buffer without numbers waits for a decoder.
+        content = binary if number == 0 else b""
     elif uri.startswith("data:"):
         try:
             content = base64.b64decode(uri.partition(",")[2], validate=True)
@@ -285,6 +328,8 @@ def _buffer(
         if name not in beside:
             raise ValueError(f"it keeps its numbers in {name}, and there is no such file beside it")
         content = beside[name]
+    if not content and buffer["byteLength"]:
+        raise ValueError(f"buffer {number} has no numbers: they are compressed, or left out")
     if len(content) < buffer["byteLength"]:
         raise ValueError(
             f"buffer {number} is cut off: {len(content)} of {buffer['byteLength']} bytes are there"

@@ -1,5 +1,6 @@
 """CAD meshes as they come from files: read, checked, never silently repaired."""
 
+import dataclasses
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SceneError
 from hybridve.hull.contact.mesh_cache import find_meshes, keep_meshes, mesh_key
 from hybridve.hull.contact.part import Contents, Part, Up, join_parts
+from hybridve.hull.contact.polygons import Cuts
 from hybridve.hull.contact.readers import FORMATS, TESSELLATED, leans_on, parse, reader_version
 from hybridve.hull.contact.topology import Topology, examine_topology
 
@@ -42,8 +44,10 @@ class CadFile:
     up : {"x", "y", "z"}
         The axis that points up by the file, or by the standard of its kind.
     tessellation_m : float or None
-        How far the triangles may be from the surface they stand for; None if the file is made of
-        triangles.
+        How far the triangles were asked to be from the surface they stand for at most; None if the
+        file is made of triangles or polygons. How far they are is said by each part.
+    notes : tuple of str
+        What the file holds besides, or leaves open; each a sentence.
     """
 
     path: Path
@@ -55,6 +59,7 @@ class CadFile:
     unit_m: float | None
     up: Up
     tessellation_m: float | None
+    notes: tuple[str, ...] = ()
 
 
 def kind_of(path: Path) -> str:
@@ -119,13 +124,19 @@ def read_cad(path: Path, *, merge: bool = False, tessellation_m: float = TESSELL
             label = f"{path}: part {part.name!r}" if len(parts) > 1 else str(path)
             check_mesh(part.vertices, part.faces, label)
         topologies = tuple(examine_topology(part.vertices, part.faces) for part in parts)
-        contents = Contents(parts, contents.unit, contents.unit_m, contents.up)
+        if all(len(part.faces) == t.n_zero_area for part, t in zip(parts, topologies, strict=True)):
+            raise SceneError(f"{path}: none of its triangles has an area; export it again")
+        _refuse_what_may_be_cut_off(path, contents, topologies)
+        contents = dataclasses.replace(contents, parts=parts)
         if key is not None:
             _keep(key, contents, topologies)
     else:
         contents, topologies = found
     for part, topology in zip(contents.parts, topologies, strict=True):
         _log_flaws(path, part, topology)
+    notes = contents.notes + _open_without_count(kind, topologies)
+    for note in notes:
+        _log.warning("%s: %s", path, note)
     return CadFile(
         path=path,
         beside=tuple(path.parent / name for name in beside),
@@ -136,6 +147,7 @@ def read_cad(path: Path, *, merge: bool = False, tessellation_m: float = TESSELL
         unit_m=contents.unit_m,
         up=contents.up,
         tessellation_m=tessellation_m if kind in TESSELLATED else None,
+        notes=notes,
     )
 
 
@@ -150,7 +162,7 @@ def _parse(
     content: bytes, kind: str, path: Path, beside: dict[str, bytes], tessellation_m: float
 ) -> Contents:
     try:
-        contents = parse(content, kind, path, beside, tessellation_m)
+        contents = parse(content, kind, beside, tessellation_m)
     except ValueError as error:
         raise SceneError(f"{path}: the file cannot be read: {error}") from error
     except ImportError as error:
@@ -160,6 +172,33 @@ def _parse(
     if not any(len(part.faces) for part in contents.parts):
         raise SceneError(f"{path}: the mesh is empty: no triangle was found in it; export it again")
     return contents
+
+
+def _refuse_what_may_be_cut_off(
+    path: Path, contents: Contents, topologies: tuple[Topology, ...]
+) -> None:
+    """Refuse a text whose last line does not end, unless none of its surfaces has an open edge.
+
+    A face at its end may lack digits or corners then. Files that are whole and lack a line end are
+    common, too; what has no open edge lacks nothing.
+    """
+    has_open_edges = any(t.n_open_edges and not t.closed for t in topologies)
+    if not contents.is_ended and has_open_edges:
+        raise SceneError(
+            f"{path}: its last line does not end and its surface has open edges, as if it were cut "
+            "off; if it is whole, end its last line"
+        )
+
+
+def _open_without_count(kind: str, topologies: tuple[Topology, ...]) -> tuple[str, ...]:
+    """Return a sentence on what cannot be known of a file that does not count its faces."""
+    n_open = sum(topology.n_open_edges for topology in topologies if not topology.closed)
+    if kind != "OBJ" or not n_open:
+        return ()
+    return (
+        f"its surface has {n_open} open edges, and an OBJ does not say how many faces it has: look "
+        "whether it is whole",
+    )
 
 
 def _find(key: str) -> tuple[Contents, tuple[Topology, ...]] | None:
@@ -175,11 +214,15 @@ def _find(key: str) -> tuple[Contents, tuple[Topology, ...]] | None:
                 faces,
                 said["material"],
                 None if said["rgba"] is None else tuple(said["rgba"]),
+                Cuts(**said["cuts"]),
+                float(said["off_by_m"]),
             )
             for (vertices, faces), said in zip(meshes, about["parts"], strict=True)
         )
         topologies = tuple(Topology(**said["topology"]) for said in about["parts"])
-        return Contents(parts, about["unit"], about["unit_m"], about["up"]), topologies
+        notes = tuple(str(note) for note in about["notes"])
+        contents = Contents(parts, about["unit"], about["unit_m"], about["up"], notes=notes)
+        return contents, topologies
     except (KeyError, TypeError, ValueError) as error:  # somebody else's entry
         _log.info("an entry of the cache cannot be used, read anew: %r", error)
         return None
@@ -190,11 +233,14 @@ def _keep(key: str, contents: Contents, topologies: tuple[Topology, ...]) -> Non
         "unit": contents.unit,
         "unit_m": contents.unit_m,
         "up": contents.up,
+        "notes": contents.notes,
         "parts": [
             {
                 "name": part.name,
                 "material": part.material,
                 "rgba": part.rgba,
+                "cuts": asdict(part.cuts),
+                "off_by_m": part.off_by_m,
                 "topology": asdict(topology),
             }
             for part, topology in zip(contents.parts, topologies, strict=True)
@@ -205,6 +251,15 @@ def _keep(key: str, contents: Contents, topologies: tuple[Topology, ...]) -> Non
 
 def _log_flaws(path: Path, part: Part, topology: Topology) -> None:
     label = f"{path}: part {part.name!r}" if part.name else str(path)
+    if part.cuts.n_bent:
+        _log.info(
+            "%s: %d of %d polygons are not flat; where they are cut into triangles moves the "
+            "surface by up to %.3g of its units",
+            label,
+            part.cuts.n_bent,
+            part.cuts.n_polygons,
+            part.cuts.bent_by,
+        )
     if topology.n_zero_area:
         _log.info(
             "%s: %d of %d triangles have no area", label, topology.n_zero_area, len(part.faces)

@@ -18,8 +18,8 @@ from hybridve.calib.cache import cache_key, find_arrays, keep_arrays
 _KIND = "meshes"
 
 #: Part of every key: the layout of an entry, what this package makes of a file by itself (it reads
-#: OBJ and glTF), and what it says of a mesh. Raised with any change of these.
-_VERSION = 3
+#: all kinds but STEP), and what it says of a mesh. Raised with any change of these.
+_VERSION = 4
 
 _Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 

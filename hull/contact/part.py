@@ -1,11 +1,13 @@
 """What a CAD file holds: parts with names, in the unit and with the axes of the file."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hybridve.hull.contact.polygons import Cuts
 
 #: Which axis of a file points up.
 Up = Literal["x", "y", "z"]
@@ -27,6 +29,11 @@ class Part:
         The name of what it is made of; empty if there is none, or more than one.
     rgba : tuple of 4 floats, or None
         Its colour, 0 to 1, as a picture shows it (sRGB), and its opacity.
+    cuts : Cuts
+        What became of its polygons.
+    off_by_m : float
+        How far its triangles are from the surface that they stand for, in metres: 0 if the file is
+        made of triangles or polygons, otherwise an estimate; see `hybridve.hull.contact.step`.
     """
 
     name: str
@@ -34,6 +41,8 @@ class Part:
     faces: NDArray[np.int32]
     material: str = ""
     rgba: tuple[float, float, float, float] | None = None
+    cuts: Cuts = field(default_factory=Cuts)
+    off_by_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,12 +59,18 @@ class Contents:
         That unit in metres; None if the file does not say.
     up : {"x", "y", "z"}
         The axis that points up by the file, or by the standard of its kind.
+    is_ended : bool
+        False if the last line of a text does not end, so that digits or corners may be missing.
+    notes : tuple of str
+        What the file holds besides and is not read, or leaves open; each a sentence.
     """
 
     parts: tuple[Part, ...]
     unit: str = ""
     unit_m: float | None = None
     up: Up = "z"
+    is_ended: bool = True
+    notes: tuple[str, ...] = ()
 
 
 def join_meshes(
@@ -95,4 +110,22 @@ def join_parts(parts: Sequence[Part]) -> Part:
     vertices, faces = join_meshes([(part.vertices, part.faces) for part in parts])
     made_of = {(part.material, part.rgba) for part in parts}
     material, rgba = made_of.pop() if len(made_of) == 1 else ("", None)
-    return Part("", vertices, faces, material, rgba)
+    cuts = sum((part.cuts for part in parts), Cuts())
+    return Part("", vertices, faces, material, rgba, cuts, max(part.off_by_m for part in parts))
+
+
+def strip_triangles(corners: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the triangles (T, 3) of a strip of corners (C,), all with the sense of the first."""
+    if len(corners) < 3:
+        return np.zeros((0, 3), np.int32)
+    faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    faces[1::2] = faces[1::2][:, [0, 2, 1]]  # every other one would be the other way round
+    return faces.astype(np.int32)
+
+
+def fan_triangles(corners: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the triangles (T, 3) of a fan of corners (C,) about the first."""
+    if len(corners) < 3:
+        return np.zeros((0, 3), np.int32)
+    hub = np.full(len(corners) - 2, corners[0])
+    return np.stack([corners[1:-1], corners[2:], hub], axis=1).astype(np.int32)

@@ -7,10 +7,11 @@ centre for a reference point unless the table gives one. In a part's name, ``/``
 ``bolt.3`` in the file's order. ``parts = "merge"`` keeps the file as one object.
 
 A file is turned so that what is up in it is up in the world, before anything else is done: glTF is
-y up by its standard, FBX arrives so, COLLADA says, all others are taken as z up, and ``up``
-overrides any of them.
-STEP, glTF and COLLADA bring their unit (glTF is metres by its standard); for all others the scene
-must give it. For glTF and COLLADA it may, against what the file says; for STEP it may not.
+y up by its standard, FBX and COLLADA say, all others are taken as z up, and ``up`` overrides any of
+them.
+STEP, glTF and COLLADA bring their unit (glTF is metres by its standard), and most FBX do; for all
+others the scene must give it. For glTF, COLLADA and FBX it may, against what the file says; for
+STEP it may not.
 """
 
 import hashlib
@@ -118,6 +119,9 @@ class SceneObject:
         see `hybridve.hull.contact.topology.meeting_faces`.
     color : tuple of 4 floats, or None
         What the file says of its colour, 0 to 1, as a picture shows it (sRGB), and its opacity.
+    tessellation_error_m : float
+        How far the triangles are from the surface that the file holds: an estimate for STEP, 0 for
+        files made of triangles or polygons. Distances to the part are uncertain by that much.
     about : dict
         What the report says of where it came from, as plain JSON values; see `load_scene`.
     vertices_mesh : (V, 3) float64 or None
@@ -136,6 +140,7 @@ class SceneObject:
     is_closed: bool = False
     solid_faces: NDArray[np.int32] | None = None
     color: tuple[float, float, float, float] | None = None
+    tessellation_error_m: float = 0.0
     about: dict[str, Any] = field(default_factory=dict)
     vertices_mesh: NDArray[np.float64] | None = None
     world_from_mesh: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))
@@ -222,6 +227,11 @@ def load_scene(path: Path) -> Scene:
             raise SceneError(str(error)) from None
         except SceneError as error:
             raise SceneError(f"{label}.mesh: {error}") from error
+        if entry.unit is None and cad.unit_m is None:
+            raise SceneError(
+                f"{label}.unit: this key is missing; this {cad.kind} file does not say its unit, "
+                f"and it is never guessed: one of {', '.join(UNITS_M)}"
+            )
         for part in _place(entry, cad):
             if part.name in objects:
                 raise SceneError(
@@ -304,6 +314,7 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             "unit_m": unit_m,
             "up": up,
             "tessellation_m": cad.tessellation_m,
+            "notes": list(cad.notes),
         }
         yield SceneObject(
             name=f"{entry.name}.{name}" if is_assembly else entry.name,
@@ -316,6 +327,7 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             is_closed=topology.closed,
             solid_faces=meeting_faces(part.vertices, part.faces) if topology.closed else None,
             color=part.rgba,
+            tessellation_error_m=part.off_by_m,
             about=about | _about_mesh(part, topology, unit_m),
             vertices_mesh=vertices_mesh,
             world_from_mesh=world_from_mesh,
@@ -327,6 +339,10 @@ def _about_mesh(part: Part, topology: Topology, unit_m: float) -> dict[str, Any]
     return {
         "n_triangles": len(part.faces),
         "n_vertices": len(part.vertices),
+        "tessellation_error_m": part.off_by_m,
+        "n_polygons": part.cuts.n_polygons,
+        "n_bent_polygons": part.cuts.n_bent,
+        "bent_by_m": part.cuts.bent_by * unit_m,
         "n_zero_area": topology.n_zero_area,
         "n_open_edges": topology.n_open_edges,
         "n_nonmanifold_edges": topology.n_nonmanifold_edges,

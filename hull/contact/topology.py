@@ -31,6 +31,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+#: How many open edges are compared with each other; more is no gap, but a surface that is open.
+_MAX_OPEN_EDGES = 4000
+
 
 @dataclass(frozen=True, slots=True)
 class Topology:
@@ -220,3 +223,57 @@ def _volume(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float6
     origin = a[0].copy()
     a, b, c = a - origin, b - origin, c - origin
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def widest_gap(vertices: NDArray[np.float64], faces: NDArray[np.int32], narrow: float) -> float:
+    """Return how wide the gaps of a surface are at most, in its unit; 0 if it has none.
+
+    From the middle of each open edge, across the gap, to the nearest open edge that runs the other
+    way. Alone among its neighbours, an edge no longer than `narrow` is the end of a gap and not its
+    side. Infinite if an edge has no other across, or there are too many to compare.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64
+        Finite.
+    faces : (T, 3) int32
+        Vertex numbers.
+    narrow : float
+        What is narrow, in the unit of the vertices.
+    """
+    places = _places(vertices, 0.0)[faces]
+    whole = _has_three_corners(places)
+    places, corners = places[whole], vertices[faces[whole]]
+    tails, heads = places.ravel(), np.roll(places, -1, axis=1).ravel()
+    base = int(places.max(initial=0)) + 1
+    keys = np.minimum(tails, heads) * base + np.maximum(tails, heads)
+    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    is_open = counts[inverse] == 1
+    if not is_open.any():
+        return 0.0
+    starts = corners.reshape(-1, 3)[is_open]
+    ends = np.roll(corners, -1, axis=1).reshape(-1, 3)[is_open]
+    apexes = np.roll(corners, -2, axis=1).reshape(-1, 3)[is_open]
+    along = ends - starts
+    lengths = np.linalg.norm(along, axis=1)
+    is_short = lengths <= narrow
+    n_short = np.bincount(
+        np.concatenate([tails[is_open][is_short], heads[is_open][is_short]]), minlength=base
+    )
+    is_end = is_short & (n_short[tails[is_open]] < 2) & (n_short[heads[is_open]] < 2)
+    if len(starts) > _MAX_OPEN_EDGES:
+        return np.inf
+    widest = 0.0
+    for edge in np.flatnonzero(~is_end).tolist():
+        middle, direction = starts[edge] + along[edge] / 2.0, along[edge] / lengths[edge]
+        outwards = middle - apexes[edge]
+        outwards = outwards - (outwards @ direction) * direction
+        outwards /= max(float(np.linalg.norm(outwards)), 1e-300)
+        against = along @ direction < -0.5 * lengths
+        share = np.einsum("ij,ij->i", middle - starts, along) / np.maximum(lengths, 1e-300) ** 2
+        across = starts + np.clip(share, 0.0, 1.0)[:, None] * along - middle
+        # Chords of two curves that are closer than these are coarse may cross.
+        facing = against & (across @ outwards >= -narrow)
+        apart = np.linalg.norm(across[facing], axis=1)
+        widest = max(widest, float(apart.min(initial=np.inf)))
+    return widest

@@ -17,8 +17,6 @@ PACKAGES = (
     "scipy",
     "open3d-cpu",
     "open3d",
-    "trimesh",
-    "pycollada",
     "cascadio",
 )
 

@@ -186,3 +186,17 @@ def step_assembly(
         )
         writer(f"CONTEXT_DEPENDENT_SHAPE_REPRESENTATION({relation},{placed})")
     return writer.text()
+
+
+def step_torus(writer: StepWriter, major: float, minor: float) -> str:
+    """Add a torus about z, its one face bounded by the two circles along which it was cut."""
+    vertex = writer(f"VERTEX_POINT('',{writer.point((major + minor, 0, 0))})")
+    around = writer(f"CIRCLE('',{writer.axes((0, 0, 0))},{major + minor!r})")
+    across = writer(f"CIRCLE('',{writer.axes((major, 0, 0), (0, -1, 0))},{float(minor)!r})")
+    edges = [writer(f"EDGE_CURVE('',{vertex},{vertex},{curve},.T.)") for curve in (around, across)]
+    loop = [
+        writer(f"ORIENTED_EDGE('',*,*,{edges[k]},.{sense}.)")
+        for k, sense in ((0, "T"), (1, "T"), (0, "F"), (1, "F"))
+    ]
+    surface = f"TOROIDAL_SURFACE('',{writer.axes((0, 0, 0))},{float(major)!r},{float(minor)!r})"
+    return writer.solid([writer.face(loop, writer(surface))])
