@@ -44,7 +44,7 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
-from hybridve.hull.contact.finding import Finding, agreed, judged, signed_clearance
+from hybridve.hull.contact.finding import Finding, agreed, judged, signed_clearance, widened
 from hybridve.hull.contact.patches import contact_patches
 from hybridve.hull.contact.recovery import recover
 from hybridve.hull.contact.respond import Response, ResponseSettings, respond
@@ -374,7 +374,11 @@ def _look(
             agreed(contact, clearance)
             for contact, clearance in zip(contacts, clearances, strict=True)
         ]
-        contacts, clearances = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        contacts = [contact for contact, _ in pairs]
+        clearances = [
+            widened(clearance, part.tessellation_error_m)
+            for (_, clearance), part in zip(pairs, chain.scene.objects, strict=True)
+        ]
     watch.lap("clearance")
     time_s = silhouettes.index / chain.session.fps
     return _Seen(silhouettes.index, time_s, hull, contacts, clearances)

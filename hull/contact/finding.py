@@ -121,6 +121,28 @@ def agreed(contact: Contact, clearance: Clearance) -> tuple[Contact, Clearance]:
     return contact, clearance
 
 
+def widened(clearance: Clearance, off_by_m: float) -> Clearance:
+    """Return the clearance of a surface that the triangles are this far from at most, metres.
+
+    A contact, 0 and 0, stays that of the triangles, as everything does that is said of it.
+    """
+    if off_by_m == 0.0:
+        return clearance
+    if clearance.upper_m > 0.0:
+        clearance = replace(
+            clearance,
+            lower_m=max(clearance.lower_m - off_by_m, 0.0),
+            upper_m=clearance.upper_m + off_by_m,
+        )
+    if clearance.depth_upper_m > 0.0:
+        clearance = replace(
+            clearance,
+            depth_lower_m=max(clearance.depth_lower_m - off_by_m, 0.0),
+            depth_upper_m=clearance.depth_upper_m + off_by_m,
+        )
+    return clearance
+
+
 def signed_clearance(clearance: Clearance) -> tuple[float, float]:
     """Return bounds of the clearance, depth counting as negative; metres.
 
