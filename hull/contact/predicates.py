@@ -122,7 +122,9 @@ def _exact_side_of_plane(
     """Sum the determinant of the rows (x, y, z, 1) of four points, term by term."""
     terms, n_terms = np.zeros(96), 0
     rows = np.zeros((4, 3))
-    rows[0], rows[1], rows[2], rows[3] = a, b, c, p
+    for axis in range(3):
+        rows[0, axis], rows[1, axis] = a[axis], b[axis]
+        rows[2, axis], rows[3, axis] = c[axis], p[axis]
     # Every choice of three rows in every order. Of the column of ones the row that is left out
     # is taken, which has the sign of (-1)^row, as the other way round is asked for.
     for x in range(4):

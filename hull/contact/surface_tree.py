@@ -91,13 +91,13 @@ def make_tree(corners: NDArray[np.float64], solid: NDArray[np.float64]) -> Surfa
     """
     both = np.concatenate([corners, solid], axis=1)
     lower, upper = both.min(axis=1), both.max(axis=1)
-    box, child, first, count, number = _build(lower, upper)
+    box, child, first, count, number, n_nodes = _build(lower, upper)
     frame = _frames(corners[number])
     return SurfaceTree(
-        box,
-        child,
-        first,
-        count,
+        box[:n_nodes].copy(),
+        child[:n_nodes].copy(),
+        first[:n_nodes].copy(),
+        count[:n_nodes].copy(),
         number,
         frame,
         np.ascontiguousarray(solid[number]).reshape(-1, 9),
@@ -143,8 +143,11 @@ def _build(
     NDArray[np.int64],
     NDArray[np.int64],
     NDArray[np.int64],
+    int,
 ]:
-    """Return boxes, first children, first triangles, counts of the nodes, and the triangles' order.
+    """Return nodes' boxes, first children, first triangles, how many; the triangles' order.
+
+    And the number of nodes: there is room for more.
 
     A node is cut in half along the axis in which the middles of its triangles are spread farthest.
     """
@@ -181,13 +184,7 @@ def _build(
             first[n_nodes + 1], count[n_nodes + 1] = begin + half, count[node] - half
             n_nodes += 2
         node += 1
-    return (
-        box[:n_nodes].copy(),
-        child[:n_nodes].copy(),
-        first[:n_nodes].copy(),
-        count[:n_nodes].copy(),
-        order,
-    )
+    return box, child, first, count, order, n_nodes
 
 
 def _frames(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -399,7 +396,7 @@ def _times_crossed(p: NDArray[np.float64], solid: NDArray[np.float64], t: int, t
     return 0
 
 
-@inlined
+@compiled
 def _winding(p: NDArray[np.float64], tree: SurfaceTree, waiting: NDArray[np.int64]) -> int:
     """Return how often the solid's surface goes round a point; `waiting` is room for a stack."""
     box, child, first, count = tree.box, tree.child, tree.first, tree.n_triangles
