@@ -206,6 +206,12 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
     index = np.indices((2 * most, 2 * most, 2 * most)).reshape(3, -1).T
     cells = (index - most) * side
     octants = np.indices((2, 2, 2)).reshape(3, -1).T
+    seen = hull.views.seen
+    recorded = (
+        (np.zeros(0, np.int32), np.full(len(matrices), -1))
+        if seen is None
+        else (seen.integrals_flat, seen.integral_offset)
+    )
     blocks = []
     while True:
         is_free, is_full = _tell(
@@ -216,6 +222,7 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
             hull.integrals_flat,
             hull.integral_offset,
             hull.views.unseen == "keep",
+            *recorded,
             int(hull.views.min_cameras),
         )
         if side == 1:
@@ -239,6 +246,8 @@ def _tell(
     integrals: NDArray[np.int32],
     integral_offset: NDArray[np.int64],
     keep: bool,
+    seen_integrals: NDArray[np.int32],
+    seen_offset: NDArray[np.int64],
     min_cameras: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which cubes (N, 3) hold no point of the hull, proved, and which hold nothing else."""
@@ -246,9 +255,9 @@ def _tell(
     is_full = np.zeros(len(centers_local), np.bool_)
     for i in range(len(centers_local)):
         x, y, z = centers_local[i]
-        n_seeing, n_full, n_none = ZERO, ZERO, ZERO
+        n_seeing, n_full, n_none, n_object = ZERO, ZERO, ZERO, ZERO
         for camera in range(len(matrices)):
-            seen, full, none = _look(
+            seen, full, none, has_object = _look(
                 x,
                 y,
                 z,
@@ -259,14 +268,17 @@ def _tell(
                 integrals,
                 integral_offset[camera],
                 keep,
+                seen_integrals,
+                seen_offset[camera],
             )
             n_seeing += seen
             n_full += full
+            n_object += has_object
             n_none += none or not (seen or keep)
             if n_none:
                 break
         needed = min_cameras if keep else len(matrices)
-        is_free[i] = n_none > 0 or n_seeing < needed
+        is_free[i] = n_none > 0 or n_object < needed
         is_full[i] = not is_free[i] and n_full == n_seeing
     return is_free, is_full
 
@@ -283,15 +295,17 @@ def _look(
     integrals: NDArray[np.int32],
     first: int,
     keep: bool,
-) -> tuple[bool, bool, bool]:
-    """Tell of a cube: a camera may see it; sees object only; sees background only."""
+    seen_integrals: NDArray[np.int32],
+    first_seen: int,
+) -> tuple[bool, bool, bool, bool]:
+    """Tell of a cube: a camera may see it; sees object only; background only; some object."""
     depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
     thick_m = half_m * (abs(m[2, 0]) + abs(m[2, 1]) + abs(m[2, 2]))
     if depth_m + thick_m <= -_NEAR_M:
-        return False, False, False
+        return False, False, False, False
     if depth_m - thick_m <= _NEAR_M:  # it straddles the camera's plane, and projects anywhere
         if not _may_be_seen(x, y, z, half_m, m, width, height):
-            return False, False, False
+            return False, False, False, False
         x0, x1, y0, y1 = 0, width, 0, height
         is_seen_wholly = False
     else:
@@ -299,20 +313,31 @@ def _look(
         left, right = _interval(x, y, z, m[0], m[2], per_depth, scale)
         top, bottom = _interval(x, y, z, m[1], m[2], per_depth, scale)
         if right < 0 or bottom < 0 or left >= width or top >= height:
-            return False, False, False
+            return False, False, False, False
         is_seen_wholly = left >= 0 and top >= 0 and right < width and bottom < height
         x0, x1 = int(max(left, 0.0)), int(min(right + 1.0, float(width)))
         y0, y1 = int(max(top, 0.0)), int(min(bottom + 1.0, float(height)))
-    above, below = first + y0 * (width + 1), first + y1 * (width + 1)
+    above, below = y0 * (width + 1), y1 * (width + 1)
+    area = (x1 - x0) * (y1 - y0)
+    if keep and first_seen >= 0:
+        n_seen = (
+            seen_integrals[first_seen + below + x1]
+            - seen_integrals[first_seen + above + x1]
+            - seen_integrals[first_seen + below + x0]
+            + seen_integrals[first_seen + above + x0]
+        )
+        if n_seen == 0:
+            return False, False, False, False
+        is_seen_wholly = is_seen_wholly and n_seen == area
     count = (
-        integrals[below + x1]
-        - integrals[above + x1]
-        - integrals[below + x0]
-        + integrals[above + x0]
+        integrals[first + below + x1]
+        - integrals[first + above + x1]
+        - integrals[first + below + x0]
+        + integrals[first + above + x0]
     )
-    # Beyond its border a camera that keeps abstains.
+    # Beyond its border, and where it recorded nothing, a camera that keeps abstains.
     sees_none = count == 0 and (is_seen_wholly or not keep)
-    return True, is_seen_wholly and count == (x1 - x0) * (y1 - y0), sees_none
+    return True, is_seen_wholly and count == area, sees_none, count > 0
 
 
 @inlined

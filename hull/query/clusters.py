@@ -110,10 +110,12 @@ def make_frame(hull: Hull) -> Frame:
     return Frame(
         views.img_from_local.reshape(-1, 12)[order],
         views.sizes_px[order],
-        _read_only(hull.masks_flat),
+        _read_only(hull.answers_flat),
         hull.mask_offset[order],
         _read_only(hull.integrals_flat),
         hull.integral_offset[order],
+        _NOTHING if views.seen is None else _read_only(views.seen.integrals_flat),
+        np.full(len(order), -1) if views.seen is None else views.seen.integral_offset[order],
         order,
         views.unseen == "keep",
         views.min_cameras,
@@ -125,6 +127,10 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+#: What stands for the integral images of what was recorded, where that is all.
+_NOTHING = _read_only(np.zeros(0, np.int32))
 
 
 class Share(NamedTuple):

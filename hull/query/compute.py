@@ -10,7 +10,8 @@ buffer of hits, and only the hits are read back. A hit is four numbers:
     triangle, first sample, how many samples, mesh       a run of samples of one triangle
     triangle, WHOLE, how many triangles, mesh            all samples of a run of triangles
 
-What does not change from frame to frame (meshes, cameras) stays on the device. Of a mesh that
+What does not change from frame to frame (meshes, cameras, what these recorded of their images)
+stays on the device. Of a mesh that
 moves, only the vertices are sent again, into the buffers of the vertices they replace;
 ``volume_round.comp.glsl`` and ``volume_bounds.comp.glsl`` then compute there what the passes need
 of them.
@@ -21,6 +22,7 @@ releases it in the thread that owns the context (an object released twice breaks
 """
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,8 +88,11 @@ class _Cameras:
     buffer: moderngl.Buffer
     pad_rows: moderngl.Buffer
     precise: moderngl.Buffer
+    recorded: moderngl.Buffer
     mask_words: NDArray[np.int64]  # where each camera's mask starts, in camera order
     n_mask_words: int
+    seen_words: NDArray[np.uint32]  # what was recorded: it follows the masks of a frame
+    seen_integrals: NDArray[np.int32]  # and the integral images of a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -283,19 +288,22 @@ class Compute(Closing):
         ends = hull.integral_offset + (views.sizes_px + 1).prod(axis=1) - 1
         order = np.argsort(hull.integrals_flat[ends] / views.sizes_px.prod(axis=1), kind="stable")
         cameras = self._cameras
+        is_new = cameras is None or cameras.views is not views
         if cameras is None or cameras.views is not views:
             cameras = self._upload_cameras(hull)
         turns = np.zeros(_room(len(views)), np.uint32)
         turns[: len(views)] = order
-        words = np.zeros(cameras.n_mask_words, "<u4")
-        packed = words.view(np.uint8)
-        for camera in range(len(views)):
-            bits = np.packbits(hull.mask(camera).reshape(-1), bitorder="little")
-            first = 4 * int(cameras.mask_words[camera])
-            packed[first : first + len(bits)] = bits
-        self._masks = self._rewrite(self._masks, words, "the masks of a frame")
-        self._integrals = self._rewrite(
-            self._integrals, hull.integrals_flat, "the integral images of a frame"
+        images = [hull.mask(camera) for camera in range(len(views))]
+        words = _packed(images, cameras.mask_words, cameras.n_mask_words)
+        self._masks = self._rewrite_before(
+            self._masks, words, cameras.seen_words, "the masks of a frame", is_new=is_new
+        )
+        self._integrals = self._rewrite_before(
+            self._integrals,
+            hull.integrals_flat,
+            cameras.seen_integrals,
+            "the integral images of a frame",
+            is_new=is_new,
         )
         self._order = self._rewrite(self._order, turns, "the cameras")
         self._cameras, self._hull = cameras, hull
@@ -310,6 +318,17 @@ class Compute(Closing):
         used["width"], used["height"] = views.sizes_px.T
         used["first_mask_word"] = mask_words[:-1]
         used["first_integral"] = hull.integral_offset
+        recorded = np.zeros((_room(len(views)), 4), np.uint32)
+        seen_words, seen_integrals = np.zeros(0, np.uint32), np.zeros(0, np.int32)
+        if views.seen is not None:
+            some = np.flatnonzero(views.seen.mask_offset >= 0)
+            starts = np.concatenate([[0], np.cumsum(n_words[some])]).astype(np.int64)
+            images = [image for k in some if (image := views.seen_mask(int(k))) is not None]
+            seen_words = _packed(images, starts[:-1], int(starts[-1]))
+            seen_integrals = views.seen.integrals_flat
+            recorded[some, 0] = mask_words[-1] + starts[:-1]
+            recorded[some, 1] = len(hull.integrals_flat) + views.seen.integral_offset[some]
+            recorded[some, 2] = 1
         pad_rows = np.zeros((_room(len(views)), 2, 4), np.float32)
         pad_rows[: len(views)] = _pad_rows(views)
         precise = np.concatenate([views.origin_world, views.img_from_local.reshape(-1)])
@@ -318,9 +337,29 @@ class Compute(Closing):
             self._upload(table.view(np.uint8), "the cameras"),
             self._upload(pad_rows, "the cameras"),
             self._upload(precise, "the cameras"),
+            self._upload(recorded, "the cameras"),
             mask_words[:-1],
             int(mask_words[-1]),
+            seen_words,
+            seen_integrals,
         )
+
+    def _rewrite_before(
+        self,
+        buffer: moderngl.Buffer,
+        array: NDArray[Any],
+        constant: NDArray[Any],
+        what: str,
+        *,
+        is_new: bool,
+    ) -> moderngl.Buffer:
+        """Write an array into a buffer, and behind it a constant one, unless that is there."""
+        if len(constant) == 0:
+            return self._rewrite(buffer, array, what)
+        if is_new or buffer.size != array.nbytes + constant.nbytes:
+            return self._rewrite(buffer, np.concatenate([array, constant]), what)
+        buffer.write(np.ascontiguousarray(array))
+        return buffer
 
     def _rewrite(self, buffer: moderngl.Buffer, array: NDArray[Any], what: str) -> moderngl.Buffer:
         """Write an array into a buffer, replaced where the size differs."""
@@ -435,6 +474,7 @@ class Compute(Closing):
         self._cameras.buffer.bind_to_uniform_block(0)
         self._cameras.pad_rows.bind_to_uniform_block(1)
         self._order.bind_to_uniform_block(2)
+        self._cameras.recorded.bind_to_uniform_block(3)
         self._integrals.bind_to_storage_buffer(0)
         self._open_clusters.bind_to_storage_buffer(2)
         self._items.bind_to_storage_buffer(6)
@@ -487,6 +527,18 @@ class Compute(Closing):
             self._context.memory_barrier(barrier | self._context.BUFFER_UPDATE_BARRIER_BIT)
         counters = np.frombuffer(self._counters.read(), np.uint32)
         return int(counters[7:-1:8].max(initial=0)), int(counters[-1])
+
+
+def _packed(
+    images: Sequence[NDArray[np.uint8]], first_word: NDArray[np.int64], n_words: int
+) -> NDArray[np.uint32]:
+    """Return images of 0 and 1 as one bit a pixel, each from a word of its own on."""
+    words = np.zeros(n_words, "<u4")
+    packed = words.view(np.uint8)
+    for image, word in zip(images, first_word.tolist(), strict=True):
+        bits = np.packbits(image.reshape(-1), bitorder="little")
+        packed[4 * word : 4 * word + len(bits)] = bits
+    return words
 
 
 def _pad_rows(views: Views) -> NDArray[np.float64]:

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
 
-#: What one camera's rectangle proves: no sample inside, all on object pixels, none seen, nothing.
-REJECTS, ACCEPTS, ABSTAINS, UNDECIDED = 0, 1, 2, 3
+#: What one camera's rectangle proves: no sample inside, all on object pixels, none seen, nothing,
+#: none seen on an object pixel (of a camera that may abstain; it may still reject some).
+REJECTS, ACCEPTS, ABSTAINS, UNDECIDED, WITHHOLDS = 0, 1, 2, 3, 4
 
 #: Triangles whose rectangles are computed together: their corners stay in the first cache.
 BATCH = 256
@@ -36,8 +37,11 @@ class Frame(NamedTuple):
         Projections in pixels from metres, local frame, row-major.
     sizes : (C, 2) int64
         Width and height.
-    masks, mask_offset, integrals, integral_offset
+    answers, mask_offset, integrals, integral_offset
         As in `hybridve.hull.query.silhouettes.Hull`.
+    seen_integrals, seen_offset
+        The integral images of `hybridve.hull.query.silhouettes.Seen`, -1 for a camera whose image
+        was recorded wholly.
     order : (C,) int64
         The number of each camera in the views.
     keep : bool
@@ -48,10 +52,12 @@ class Frame(NamedTuple):
 
     matrices: NDArray[np.float64]
     sizes: NDArray[np.int64]
-    masks: NDArray[np.uint8]
+    answers: NDArray[np.uint8]
     mask_offset: NDArray[np.int64]
     integrals: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
+    seen_integrals: NDArray[np.int32]
+    seen_offset: NDArray[np.int64]
     order: NDArray[np.int64]
     keep: bool
     min_cameras: int
@@ -102,10 +108,13 @@ def rectangle_vote(
     first: int,
     integrals: NDArray[np.int32],
     keep: bool,
+    first_seen: int,
+    seen_integrals: NDArray[np.int32],
 ) -> int:
     """Return what a rectangle of pixels, clamped to -1..size, proves in one camera.
 
-    Its image is width x height pixels, its integral image begins at `first`.
+    Its image is width x height pixels, its integral image begins at `first`, and that of what it
+    recorded at `first_seen`, below 0 if that is all of it.
     """
     x0, x1 = max(first_x, 0), min(last_x + 1, width)
     y0, y1 = max(first_y, 0), min(last_y + 1, height)
@@ -119,8 +128,23 @@ def rectangle_vote(
         - integrals[below + x0]
         + integrals[above + x0]
     )
-    if count == 0 and (wholly_seen or not keep):
-        return REJECTS
+    if not keep:
+        if count == 0:
+            return REJECTS
+    else:
+        if first_seen >= 0:
+            above, below = first_seen + y0 * (width + 1), first_seen + y1 * (width + 1)
+            n_seen = (
+                seen_integrals[below + x1]
+                - seen_integrals[above + x1]
+                - seen_integrals[below + x0]
+                + seen_integrals[above + x0]
+            )
+            if n_seen == 0:
+                return ABSTAINS
+            wholly_seen = wholly_seen and n_seen == (x1 - x0) * (y1 - y0)
+        if count == 0:
+            return REJECTS if wholly_seen else WITHHOLDS
     if wholly_seen and count == (x1 - x0) * (y1 - y0):
         return ACCEPTS
     return UNDECIDED
@@ -260,6 +284,8 @@ def _node_verdict(
     sizes: NDArray[np.int64],
     integrals: NDArray[np.int32],
     integral_offset: NDArray[np.int64],
+    seen_integrals: NDArray[np.int32],
+    seen_offset: NDArray[np.int64],
     keep: bool,
     min_cameras: int,
     cameras: NDArray[np.int64],
@@ -278,7 +304,7 @@ def _node_verdict(
     is_free : bool
         Whether no sample of the node can be inside.
     """
-    n_left = ZERO
+    n_left, n_withheld = ZERO, ZERO
     for number in range(n_cameras):
         camera = cameras[number]
         place = order[camera]
@@ -292,15 +318,18 @@ def _node_verdict(
             integral_offset[camera],
             integrals,
             keep,
+            seen_offset[camera],
+            seen_integrals,
         )
         if vote == REJECTS:
             return n_left, n_accept, True
         if vote == ACCEPTS:
             n_accept += 1
-        elif vote == UNDECIDED:
+        elif vote != ABSTAINS:
             left[n_left] = camera
             n_left += 1
-    return n_left, n_accept, keep and n_accept + n_left < min_cameras
+            n_withheld += vote == WITHHOLDS
+    return n_left, n_accept, keep and n_accept + n_left - n_withheld < min_cameras
 
 
 @compiled
@@ -323,6 +352,8 @@ def open_nodes(level: int, tree: Tree, frame: Frame) -> NDArray[np.int64]:
                 frame.sizes,
                 frame.integrals,
                 frame.integral_offset,
+                frame.seen_integrals,
+                frame.seen_offset,
                 frame.keep,
                 frame.min_cameras,
                 cameras,
@@ -362,6 +393,7 @@ def _batch_verdicts(
     rectangles: NDArray[np.int32],
     triangle: NDArray[np.int64],
     accepted: NDArray[np.int64],
+    supported: NDArray[np.int64],
     is_open: NDArray[np.bool_],
 ) -> int:
     """Ask some cameras, one after the other, about consecutive triangles; return how many are left.
@@ -376,19 +408,21 @@ def _batch_verdicts(
         Written: the triangles that are not proved free, ascending.
     accepted : (n,) int64
         Written: how many cameras see nothing but object pixels of each.
+    supported : (n,) int64
+        Written: how many cameras may see an object pixel of each.
     is_open : (n, C) bool
         Written: which cameras are undecided about it.
     """
     load_corners(start, n_triangles, surface.vertices_local, surface.faces, corners)
-    integrals, keep = frame.integrals, frame.keep
+    integrals, keep, seen_integrals = frame.integrals, frame.keep, frame.seen_integrals
     all_cameras = len(frame.matrices)
     for i in range(n_triangles):
-        triangle[i], accepted[i] = start + i, n_accept
+        triangle[i], accepted[i], supported[i] = start + i, n_accept, n_accept
     n_left = n_triangles
     for number in range(n_cameras):
         camera = cameras[number]
         width, height = frame.sizes[camera, 0], frame.sizes[camera, 1]
-        first = frame.integral_offset[camera]
+        first, first_seen = frame.integral_offset[camera], frame.seen_offset[camera]
         triangle_rectangles(
             n_left, corners, frame.matrices[camera], width, height, surface.pads[camera], rectangles
         )
@@ -405,20 +439,20 @@ def _batch_verdicts(
                 first,
                 integrals,
                 keep,
+                first_seen,
+                seen_integrals,
             )
             if vote == REJECTS:
                 continue
             n_accepted = accepted[i] + (vote == ACCEPTS)
+            n_supported = supported[i] + (vote in (ACCEPTS, UNDECIDED))
+            if keep and n_supported + n_later < frame.min_cameras:
+                continue
             for other in range(all_cameras):
                 is_open[n_kept, other] = number > 0 and is_open[i, other]
-            is_open[n_kept, camera] = vote == UNDECIDED
-            if keep:
-                n_open = 0
-                for other in range(all_cameras):
-                    n_open += is_open[n_kept, other]
-                if n_accepted + n_open + n_later < frame.min_cameras:
-                    continue
+            is_open[n_kept, camera] = vote in (UNDECIDED, WITHHOLDS)
             triangle[n_kept], accepted[n_kept] = triangle[i], n_accepted
+            supported[n_kept] = n_supported
             for k in range(9):
                 corners[k, n_kept] = corners[k, i]
             n_kept += 1
@@ -448,6 +482,7 @@ def survivors(
     stack = np.zeros(((level + 1) * BRANCH + 1, 2), np.int64)  # node within its level, level
     corners, parts = np.zeros((9, BATCH)), np.zeros((4, BATCH), np.int32)
     triangle, accepted = np.zeros(BATCH, np.int64), np.zeros(BATCH, np.int64)
+    supported = np.zeros(BATCH, np.int64)
     is_open = np.zeros((BATCH, n_cameras), np.bool_)
 
     capacity = 4 * BATCH
@@ -472,6 +507,8 @@ def survivors(
                     sizes,
                     integrals,
                     integral_offset,
+                    frame.seen_integrals,
+                    frame.seen_offset,
                     frame.keep,
                     frame.min_cameras,
                     cameras[height + 1],
@@ -504,6 +541,7 @@ def survivors(
                     parts,
                     triangle,
                     accepted,
+                    supported,
                     is_open,
                 )
                 for kept in range(n_kept):
