@@ -206,12 +206,6 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
     index = np.indices((2 * most, 2 * most, 2 * most)).reshape(3, -1).T
     cells = (index - most) * side
     octants = np.indices((2, 2, 2)).reshape(3, -1).T
-    seen = hull.views.seen
-    recorded = (
-        (np.zeros(0, np.int32), np.full(len(matrices), -1))
-        if seen is None
-        else (seen.integrals_flat, seen.integral_offset)
-    )
     blocks = []
     while True:
         is_free, is_full = _tell(
@@ -221,8 +215,8 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
             np.ascontiguousarray(hull.views.sizes_px),
             hull.integrals_flat,
             hull.integral_offset,
+            None if hull.views.seen is None else hull.recorded_offset,
             hull.views.unseen == "keep",
-            *recorded,
             int(hull.views.min_cameras),
         )
         if side == 1:
@@ -245,9 +239,8 @@ def _tell(
     sizes: NDArray[np.int64],
     integrals: NDArray[np.int32],
     integral_offset: NDArray[np.int64],
+    recorded: NDArray[np.int64] | None,
     keep: bool,
-    seen_integrals: NDArray[np.int32],
-    seen_offset: NDArray[np.int64],
     min_cameras: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which cubes (N, 3) hold no point of the hull, proved, and which hold nothing else."""
@@ -268,8 +261,8 @@ def _tell(
                 integrals,
                 integral_offset[camera],
                 keep,
-                seen_integrals,
-                seen_offset[camera],
+                camera,
+                recorded,
             )
             n_seeing += seen
             n_full += full
@@ -295,8 +288,8 @@ def _look(
     integrals: NDArray[np.int32],
     first: int,
     keep: bool,
-    seen_integrals: NDArray[np.int32],
-    first_seen: int,
+    camera: int,
+    recorded: NDArray[np.int64] | None,
 ) -> tuple[bool, bool, bool, bool]:
     """Tell of a cube: a camera may see it; sees object only; background only; some object."""
     depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
@@ -319,16 +312,18 @@ def _look(
         y0, y1 = int(max(top, 0.0)), int(min(bottom + 1.0, float(height)))
     above, below = y0 * (width + 1), y1 * (width + 1)
     area = (x1 - x0) * (y1 - y0)
-    if keep and first_seen >= 0:
-        n_seen = (
-            seen_integrals[first_seen + below + x1]
-            - seen_integrals[first_seen + above + x1]
-            - seen_integrals[first_seen + below + x0]
-            + seen_integrals[first_seen + above + x0]
-        )
-        if n_seen == 0:
-            return False, False, False, False
-        is_seen_wholly = is_seen_wholly and n_seen == area
+    if recorded is not None:  # not compiled where it is
+        start = recorded[camera]
+        if start >= 0:
+            n_seen = (
+                integrals[start + below + x1]
+                - integrals[start + above + x1]
+                - integrals[start + below + x0]
+                + integrals[start + above + x0]
+            )
+            if n_seen == 0:
+                return False, False, False, False
+            is_seen_wholly = is_seen_wholly and n_seen == area
     count = (
         integrals[first + below + x1]
         - integrals[first + above + x1]

@@ -564,6 +564,7 @@ def without_camera(hull: Hull, camera: int) -> Hull:
         views=fewer,
         mask_offset=hull.mask_offset[rest],
         integral_offset=hull.integral_offset[rest],
+        recorded_offset=hull.recorded_offset[rest],
     )
 
 

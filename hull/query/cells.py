@@ -1,8 +1,12 @@
 """Cells of space in the hull's sight: cubes that are cut into eight, and what is proved of each.
 
 A cube is *free* where the rectangle that it projects into holds no object pixel in some camera:
-then no point of it is in the hull. The argument is that of `hybridve.hull.query.bounds`, with
-another rectangle, which spares the projection of eight corners. Let p be the pixel of the cube's
+then no point of it is in the hull. A camera that may abstain must see all of the rectangle for
+that. Where it sees a part, without an object pixel, it can support no point of the cube, and the
+cube is free as well once fewer than ``min_cameras`` cameras can. (Without this, cubes astride the
+border of what a camera sees would stay open however small they are, and all along that border.)
+The argument is that of `hybridve.hull.query.bounds`, with another rectangle, which spares the
+projection of eight corners. Let p be the pixel of the cube's
 centre, h half of its edge, P the projection matrix, w the depth of the centre, and x = center + d
 with |d_j| <= h. Then the pixel of x is off p, along the image's rows, by
 
@@ -27,7 +31,13 @@ from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.clusters import make_frame
-from hybridve.hull.query.rectangles import ACCEPTS, REJECTS, UNDECIDED, Frame, rectangle_vote
+from hybridve.hull.query.rectangles import (
+    ACCEPTS,
+    REJECTS,
+    UNDECIDED,
+    Frame,
+    rectangle_vote,
+)
 from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, Hull
 
 _PAD = 40.0 * 2.0**-53
@@ -192,7 +202,7 @@ def split_cells(
     offset_x, offset_y, offset_z = asked.offset_local
     matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
     answers, mask_offset = frame.answers, frame.mask_offset
-    integral_offset, seen_integrals = frame.integral_offset, frame.seen_integrals
+    integral_offset = frame.integral_offset
     keep, min_cameras, n_cameras = frame.keep, frame.min_cameras, len(frame.matrices)
     whole = np.zeros(8 * len(center), np.int64)
     part_center = np.zeros((8 * len(center), 3))
@@ -260,8 +270,8 @@ def split_cells(
                     integral_offset[camera],
                     integrals,
                     keep,
-                    frame.seen_offset[camera],
-                    seen_integrals,
+                    camera,
+                    frame.recorded,
                 )
                 if vote == REJECTS:
                     is_free = True

@@ -274,7 +274,7 @@ def _certify_triangle(
     """
     matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
     answers, mask_offset = frame.answers, frame.mask_offset
-    integral_offset, seen_integrals = frame.integral_offset, frame.seen_integrals
+    integral_offset = frame.integral_offset
     keep, min_cameras = frame.keep, frame.min_cameras
     all_cameras, room = len(matrices), len(cells)
     corners, rectangle = np.zeros((9, 1)), np.zeros((4, 1), np.int32)
@@ -303,8 +303,8 @@ def _certify_triangle(
                 integral_offset[camera],
                 integrals,
                 keep,
-                frame.seen_offset[camera],
-                seen_integrals,
+                camera,
+                frame.recorded,
             )
             if vote == REJECTS:
                 is_free = True

@@ -105,8 +105,7 @@ def make_frame(hull: Hull) -> Frame:
     The camera that sees the smallest silhouette rejects most: it is asked first.
     """
     views = hull.views
-    ends = hull.integral_offset + (views.sizes_px + 1).prod(axis=1) - 1
-    order = np.argsort(hull.integrals_flat[ends] / views.sizes_px.prod(axis=1), kind="stable")
+    order = np.argsort(hull.object_shares(), kind="stable")
     return Frame(
         views.img_from_local.reshape(-1, 12)[order],
         views.sizes_px[order],
@@ -114,8 +113,7 @@ def make_frame(hull: Hull) -> Frame:
         hull.mask_offset[order],
         _read_only(hull.integrals_flat),
         hull.integral_offset[order],
-        _NOTHING if views.seen is None else _read_only(views.seen.integrals_flat),
-        np.full(len(order), -1) if views.seen is None else views.seen.integral_offset[order],
+        None if views.seen is None else hull.recorded_offset[order],
         order,
         views.unseen == "keep",
         views.min_cameras,
@@ -127,10 +125,6 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
-
-
-#: What stands for the integral images of what was recorded, where that is all.
-_NOTHING = _read_only(np.zeros(0, np.int32))
 
 
 class Share(NamedTuple):

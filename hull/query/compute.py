@@ -92,7 +92,6 @@ class _Cameras:
     mask_words: NDArray[np.int64]  # where each camera's mask starts, in camera order
     n_mask_words: int
     seen_words: NDArray[np.uint32]  # what was recorded: it follows the masks of a frame
-    seen_integrals: NDArray[np.int32]  # and the integral images of a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +178,7 @@ class Compute(Closing):
         self._group_size = _SOFTWARE_GROUP_SIZE if is_software else _GROUP_SIZE
         self._max_groups = _SOFTWARE_MAX_GROUPS if is_software else _MAX_GROUPS
         self._reject = reject
-        self._programs: dict[int, _Programs] = {}
+        self._programs: dict[tuple[int, bool], _Programs] = {}
         self._placing: tuple[moderngl.ComputeShader, moderngl.ComputeShader] | None = None
         self._cameras: _Cameras | None = None
         self._hull: Hull | None = None
@@ -247,8 +246,11 @@ class Compute(Closing):
             return self._reserve(4)
         return self._context.buffer(np.ascontiguousarray(array))
 
-    def programs_for(self, n_cameras: int) -> _Programs:
+    def programs_for(self, n_cameras: int, *, has_gaps: bool = False) -> _Programs:
         """Return the passes, compiled with room for `n_cameras` in shared memory.
+
+        With `has_gaps` for cameras that did not record all of their images: a software renderer
+        would take the look-ups that this needs for all others, too.
 
         A query does so by itself; asked beforehand, it tells whether the driver compiles them.
 
@@ -259,14 +261,15 @@ class Compute(Closing):
         """
         make_current(self._context)
         room = _room(n_cameras)
-        if room not in self._programs:
-            rectangle = f"#define N_CAMERAS {room}\n" + load_shader("rectangle.glsl")
-            self._programs[room] = _Programs(
+        if (room, has_gaps) not in self._programs:
+            constants = f"#define N_CAMERAS {room}\n#define GAPS {int(has_gaps)}\n"
+            rectangle = constants + load_shader("rectangle.glsl")
+            self._programs[room, has_gaps] = _Programs(
                 self._compile("volume_cluster.comp.glsl", rectangle),
                 self._compile("volume_reject.comp.glsl", rectangle),
                 self._compile("volume_sample.comp.glsl", rectangle),
             )
-        return self._programs[room]
+        return self._programs[room, has_gaps]
 
     def _compile(self, name: str, *parts: str) -> moderngl.ComputeShader:
         constants = (
@@ -285,25 +288,18 @@ class Compute(Closing):
         """
         views = hull.views
         # The camera that sees the smallest silhouette rejects most: ask it first.
-        ends = hull.integral_offset + (views.sizes_px + 1).prod(axis=1) - 1
-        order = np.argsort(hull.integrals_flat[ends] / views.sizes_px.prod(axis=1), kind="stable")
+        order = np.argsort(hull.object_shares(), kind="stable")
         cameras = self._cameras
-        is_new = cameras is None or cameras.views is not views
         if cameras is None or cameras.views is not views:
             cameras = self._upload_cameras(hull)
         turns = np.zeros(_room(len(views)), np.uint32)
         turns[: len(views)] = order
         images = [hull.mask(camera) for camera in range(len(views))]
         words = _packed(images, cameras.mask_words, cameras.n_mask_words)
-        self._masks = self._rewrite_before(
-            self._masks, words, cameras.seen_words, "the masks of a frame", is_new=is_new
-        )
-        self._integrals = self._rewrite_before(
-            self._integrals,
-            hull.integrals_flat,
-            cameras.seen_integrals,
-            "the integral images of a frame",
-            is_new=is_new,
+        words = np.concatenate([words, cameras.seen_words])
+        self._masks = self._rewrite(self._masks, words, "the masks of a frame")
+        self._integrals = self._rewrite(
+            self._integrals, hull.integrals_flat, "the integral images of a frame"
         )
         self._order = self._rewrite(self._order, turns, "the cameras")
         self._cameras, self._hull = cameras, hull
@@ -319,15 +315,14 @@ class Compute(Closing):
         used["first_mask_word"] = mask_words[:-1]
         used["first_integral"] = hull.integral_offset
         recorded = np.zeros((_room(len(views)), 4), np.uint32)
-        seen_words, seen_integrals = np.zeros(0, np.uint32), np.zeros(0, np.int32)
+        seen_words = np.zeros(0, np.uint32)
         if views.seen is not None:
             some = np.flatnonzero(views.seen.mask_offset >= 0)
             starts = np.concatenate([[0], np.cumsum(n_words[some])]).astype(np.int64)
             images = [image for k in some if (image := views.seen_mask(int(k))) is not None]
             seen_words = _packed(images, starts[:-1], int(starts[-1]))
-            seen_integrals = views.seen.integrals_flat
             recorded[some, 0] = mask_words[-1] + starts[:-1]
-            recorded[some, 1] = len(hull.integrals_flat) + views.seen.integral_offset[some]
+            recorded[some, 1] = hull.recorded_offset[some]
             recorded[some, 2] = 1
         pad_rows = np.zeros((_room(len(views)), 2, 4), np.float32)
         pad_rows[: len(views)] = _pad_rows(views)
@@ -341,25 +336,7 @@ class Compute(Closing):
             mask_words[:-1],
             int(mask_words[-1]),
             seen_words,
-            seen_integrals,
         )
-
-    def _rewrite_before(
-        self,
-        buffer: moderngl.Buffer,
-        array: NDArray[Any],
-        constant: NDArray[Any],
-        what: str,
-        *,
-        is_new: bool,
-    ) -> moderngl.Buffer:
-        """Write an array into a buffer, and behind it a constant one, unless that is there."""
-        if len(constant) == 0:
-            return self._rewrite(buffer, array, what)
-        if is_new or buffer.size != array.nbytes + constant.nbytes:
-            return self._rewrite(buffer, np.concatenate([array, constant]), what)
-        buffer.write(np.ascontiguousarray(array))
-        return buffer
 
     def _rewrite(self, buffer: moderngl.Buffer, array: NDArray[Any], what: str) -> moderngl.Buffer:
         """Write an array into a buffer, replaced where the size differs."""
@@ -466,7 +443,7 @@ class Compute(Closing):
     ) -> tuple[int, int]:
         """Run the passes of some launches; return how many items and hits they have."""
         assert self._cameras is not None
-        programs = self.programs_for(len(views))
+        programs = self.programs_for(len(views), has_gaps=views.seen is not None)
         counters = np.append(np.tile(_LAUNCH_COUNTERS, len(launches)), np.uint32(0))
         self._counters = self._rewrite(self._counters, counters, "the counters")
         most_clusters = max((x.stop - x.start for x in launches), default=0) // _CLUSTER + 2

@@ -129,8 +129,8 @@ def _tile_vote(
     first: int,
     integrals: NDArray[np.int32],
     keep: bool,
-    first_seen: int,
-    seen_integrals: NDArray[np.int32],
+    camera: int,
+    recorded: NDArray[np.int64] | None,
 ) -> int:
     """Return what one camera proves of samples i0 <= i < i0 + size, likewise j, i + j <= last."""
     reach = size - 1
@@ -178,8 +178,8 @@ def _tile_vote(
         first,
         integrals,
         keep,
-        first_seen,
-        seen_integrals,
+        camera,
+        recorded,
     )
 
 
@@ -298,8 +298,8 @@ def _sample_block(
                     frame.integral_offset[camera],
                     integrals,
                     keep,
-                    frame.seen_offset[camera],
-                    frame.seen_integrals,
+                    camera,
+                    frame.recorded,
                 )
             if vote == REJECTS:
                 is_free = True

@@ -39,9 +39,9 @@ class Frame(NamedTuple):
         Width and height.
     answers, mask_offset, integrals, integral_offset
         As in `hybridve.hull.query.silhouettes.Hull`.
-    seen_integrals, seen_offset
-        The integral images of `hybridve.hull.query.silhouettes.Seen`, -1 for a camera whose image
-        was recorded wholly.
+    recorded : (C,) int64 or None
+        `hybridve.hull.query.silhouettes.Hull.recorded_offset`; None where all cameras recorded all
+        of their images. That is another type, so that the loops for them are compiled without.
     order : (C,) int64
         The number of each camera in the views.
     keep : bool
@@ -56,8 +56,7 @@ class Frame(NamedTuple):
     mask_offset: NDArray[np.int64]
     integrals: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
-    seen_integrals: NDArray[np.int32]
-    seen_offset: NDArray[np.int64]
+    recorded: NDArray[np.int64] | None
     order: NDArray[np.int64]
     keep: bool
     min_cameras: int
@@ -108,13 +107,13 @@ def rectangle_vote(
     first: int,
     integrals: NDArray[np.int32],
     keep: bool,
-    first_seen: int,
-    seen_integrals: NDArray[np.int32],
+    camera: int,
+    recorded: NDArray[np.int64] | None,
 ) -> int:
     """Return what a rectangle of pixels, clamped to -1..size, proves in one camera.
 
     Its image is width x height pixels, its integral image begins at `first`, and that of what it
-    recorded at `first_seen`, below 0 if that is all of it.
+    recorded where `recorded` says of it.
     """
     x0, x1 = max(first_x, 0), min(last_x + 1, width)
     y0, y1 = max(first_y, 0), min(last_y + 1, height)
@@ -128,23 +127,21 @@ def rectangle_vote(
         - integrals[below + x0]
         + integrals[above + x0]
     )
-    if not keep:
-        if count == 0:
-            return REJECTS
-    else:
-        if first_seen >= 0:
-            above, below = first_seen + y0 * (width + 1), first_seen + y1 * (width + 1)
+    if recorded is not None:  # not compiled where it is
+        start = recorded[camera]
+        if start >= 0:
+            above, below = start + y0 * (width + 1), start + y1 * (width + 1)
             n_seen = (
-                seen_integrals[below + x1]
-                - seen_integrals[above + x1]
-                - seen_integrals[below + x0]
-                + seen_integrals[above + x0]
+                integrals[below + x1]
+                - integrals[above + x1]
+                - integrals[below + x0]
+                + integrals[above + x0]
             )
             if n_seen == 0:
                 return ABSTAINS
             wholly_seen = wholly_seen and n_seen == (x1 - x0) * (y1 - y0)
-        if count == 0:
-            return REJECTS if wholly_seen else WITHHOLDS
+    if count == 0:
+        return REJECTS if wholly_seen or not keep else WITHHOLDS
     if wholly_seen and count == (x1 - x0) * (y1 - y0):
         return ACCEPTS
     return UNDECIDED
@@ -284,8 +281,7 @@ def _node_verdict(
     sizes: NDArray[np.int64],
     integrals: NDArray[np.int32],
     integral_offset: NDArray[np.int64],
-    seen_integrals: NDArray[np.int32],
-    seen_offset: NDArray[np.int64],
+    recorded: NDArray[np.int64] | None,
     keep: bool,
     min_cameras: int,
     cameras: NDArray[np.int64],
@@ -318,8 +314,8 @@ def _node_verdict(
             integral_offset[camera],
             integrals,
             keep,
-            seen_offset[camera],
-            seen_integrals,
+            camera,
+            recorded,
         )
         if vote == REJECTS:
             return n_left, n_accept, True
@@ -352,8 +348,7 @@ def open_nodes(level: int, tree: Tree, frame: Frame) -> NDArray[np.int64]:
                 frame.sizes,
                 frame.integrals,
                 frame.integral_offset,
-                frame.seen_integrals,
-                frame.seen_offset,
+                frame.recorded,
                 frame.keep,
                 frame.min_cameras,
                 cameras,
@@ -409,12 +404,12 @@ def _batch_verdicts(
     accepted : (n,) int64
         Written: how many cameras see nothing but object pixels of each.
     supported : (n,) int64
-        Written: how many cameras may see an object pixel of each.
+        Written, where cameras may abstain: how many may see an object pixel of each.
     is_open : (n, C) bool
         Written: which cameras are undecided about it.
     """
     load_corners(start, n_triangles, surface.vertices_local, surface.faces, corners)
-    integrals, keep, seen_integrals = frame.integrals, frame.keep, frame.seen_integrals
+    integrals, keep = frame.integrals, frame.keep
     all_cameras = len(frame.matrices)
     for i in range(n_triangles):
         triangle[i], accepted[i], supported[i] = start + i, n_accept, n_accept
@@ -422,7 +417,7 @@ def _batch_verdicts(
     for number in range(n_cameras):
         camera = cameras[number]
         width, height = frame.sizes[camera, 0], frame.sizes[camera, 1]
-        first, first_seen = frame.integral_offset[camera], frame.seen_offset[camera]
+        first = frame.integral_offset[camera]
         triangle_rectangles(
             n_left, corners, frame.matrices[camera], width, height, surface.pads[camera], rectangles
         )
@@ -439,20 +434,21 @@ def _batch_verdicts(
                 first,
                 integrals,
                 keep,
-                first_seen,
-                seen_integrals,
+                camera,
+                frame.recorded,
             )
             if vote == REJECTS:
                 continue
             n_accepted = accepted[i] + (vote == ACCEPTS)
-            n_supported = supported[i] + (vote in (ACCEPTS, UNDECIDED))
-            if keep and n_supported + n_later < frame.min_cameras:
-                continue
+            if keep:
+                n_supported = supported[i] + (vote in (ACCEPTS, UNDECIDED))
+                if n_supported + n_later < frame.min_cameras:
+                    continue
+                supported[n_kept] = n_supported
             for other in range(all_cameras):
                 is_open[n_kept, other] = number > 0 and is_open[i, other]
             is_open[n_kept, camera] = vote in (UNDECIDED, WITHHOLDS)
             triangle[n_kept], accepted[n_kept] = triangle[i], n_accepted
-            supported[n_kept] = n_supported
             for k in range(9):
                 corners[k, n_kept] = corners[k, i]
             n_kept += 1
@@ -507,8 +503,7 @@ def survivors(
                     sizes,
                     integrals,
                     integral_offset,
-                    frame.seen_integrals,
-                    frame.seen_offset,
+                    frame.recorded,
                     frame.keep,
                     frame.min_cameras,
                     cameras[height + 1],

@@ -329,9 +329,11 @@ class Hull:
         Where each camera's mask starts in `masks_flat` and `answers_flat`.
     integrals_flat : (sum of (H+1)*(W+1),) int32
         Per camera the number of object pixels above and left of each pixel corner
-        (``cv2.integral``), so that four look-ups count the object pixels of a rectangle.
-    integral_offset : (C,) int64
-        Where each camera's integral image starts in `integrals_flat`.
+        (``cv2.integral``), so that four look-ups count the object pixels of a rectangle. Behind
+        them, those of the views' `Seen`: compiled code takes one array sooner than two.
+    integral_offset, recorded_offset : (C,) int64
+        Where each camera's integral images start in `integrals_flat`: that of object pixels, and
+        that of recorded pixels, -1 for a camera that recorded all of its image.
     """
 
     views: Views
@@ -340,6 +342,7 @@ class Hull:
     mask_offset: NDArray[np.int64]
     integrals_flat: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
+    recorded_offset: NDArray[np.int64]
 
     def mask(self, camera: int) -> NDArray[np.uint8]:
         """Return the (H, W) silhouette of one camera, 1 on object pixels."""
@@ -360,6 +363,11 @@ class Hull:
         start = int(self.integral_offset[camera])
         stop = start + (width + 1) * (height + 1)
         return self.integrals_flat[start:stop].reshape(height + 1, width + 1)
+
+    def object_shares(self) -> NDArray[np.float64]:
+        """Return which share (C,) of each image are object pixels."""
+        ends = self.integral_offset + (self.views.sizes_px + 1).prod(axis=1) - 1
+        return np.asarray(self.integrals_flat[ends] / self.views.sizes_px.prod(axis=1))
 
 
 def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
@@ -384,15 +392,24 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
     corners = (views.sizes_px + 1).prod(axis=1)
     mask_offset = np.concatenate([[0], np.cumsum(areas)[:-1]]).astype(np.int64)
     integral_offset = np.concatenate([[0], np.cumsum(corners)[:-1]]).astype(np.int64)
+    recorded_offset = np.full(len(views), -1, np.int64)
     masks_flat = np.zeros(int(areas.sum()), np.uint8)
+    n_corners = n_integrals = int(corners.sum())
+    if views.seen is not None:
+        has_gaps = views.seen.integral_offset >= 0
+        recorded_offset[has_gaps] = n_corners + views.seen.integral_offset[has_gaps]
+        n_integrals += len(views.seen.integrals_flat)
     hull = Hull(
         views,
         masks_flat,
         masks_flat if views.seen is None else np.zeros_like(masks_flat),
         mask_offset,
-        np.zeros(int(corners.sum()), np.int32),
+        np.zeros(n_integrals, np.int32),
         integral_offset,
+        recorded_offset,
     )
+    if views.seen is not None:
+        hull.integrals_flat[n_corners:] = views.seen.integrals_flat
     for camera, mask in enumerate(masks):
         target = hull.mask(camera)
         if mask.shape != target.shape:

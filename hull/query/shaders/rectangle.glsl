@@ -18,7 +18,8 @@
 // |         |           |                 | recorded pixels, of cameras that did not record all  |
 //
 // N_CAMERAS, at least n_cameras, is the room in the blocks: 256 cameras fill 16 KiB, which every
-// device offers. REJECT is 0 where rectangles are to decide nothing.
+// device offers. REJECT is 0 where rectangles are to decide nothing, and GAPS is 1 where some camera
+// did not record all of its image; block 3 is asked then only.
 //
 // The pads of a camera are linear in the reach of a set, its largest absolute coordinates (M in
 // bounds.py). So each set has pads of its own, from its own corners, and a mesh that moves needs
@@ -33,7 +34,9 @@ struct Camera {
 layout(std140, binding = 0) uniform Cameras { Camera cameras[N_CAMERAS]; };
 layout(std140, binding = 1) uniform Pads { vec4 pad_rows[2 * N_CAMERAS]; };
 layout(std140, binding = 2) uniform Order { uvec4 order[N_CAMERAS / 4]; };
+#if GAPS
 layout(std140, binding = 3) uniform Recorded { uvec4 recorded[N_CAMERAS]; };
+#endif
 layout(std430, binding = 0) readonly buffer Integrals { int integrals[]; };
 
 uniform uint n_cameras;
@@ -110,11 +113,13 @@ uint camera_vote(uint c, Extent extent, vec3 pads) {
     uint stride = cameras[c].image.x + 1u;
     ivec2 extent_px = stop - start;
     int area = extent_px.x * extent_px.y;
-    if (keep != 0u && recorded[c].z != 0u) {
+#if GAPS
+    if (recorded[c].z != 0u) {
         int n_seen = count_pixels(recorded[c].y, stride, start, stop);
         if (n_seen == 0) return ABSTAINS;
         wholly_seen = wholly_seen && n_seen == area;
     }
+#endif
     int count = count_pixels(cameras[c].image.w, stride, start, stop);
     if (count == 0) return wholly_seen || keep == 0u ? REJECTS : WITHHOLDS;
     if (wholly_seen && count == area) return ACCEPTS;

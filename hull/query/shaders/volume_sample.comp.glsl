@@ -216,8 +216,10 @@ uint sample_vote(uint c, int di, int dj) {
     }
     uint bit = uint(pixel.y) * uint(size_px.x) + uint(pixel.x);
     if (is_set(cameras[c].image.z, bit)) return ACCEPTS;
-    if (keep == 0u || recorded[c].z == 0u) return REJECTS;
-    return is_set(recorded[c].x, bit) ? REJECTS : ABSTAINS;
+#if GAPS
+    if (recorded[c].z != 0u && !is_set(recorded[c].x, bit)) return ABSTAINS;
+#endif
+    return REJECTS;
 }
 
 bool is_inside(int di, int dj) {
