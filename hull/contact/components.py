@@ -14,7 +14,16 @@ pixel (`grown`). That holds whatever is real, if it is not thinner than a pixel.
 Volumes are connected cells: space is cut into cubes, coarse to fine, and a cube is kept unless one
 camera sees no object pixel in the rectangle around its projection. What is connected in the hull
 is connected in cells, so volumes that are told apart are apart; two that come nearer to each other
-than some two cells may be told as one, which can make a phantom part of something real.
+than some two cells may be told as one.
+
+What "real" says, and what not
+------------------------------
+The proof is of a volume as a whole: somewhere in it is something real. Where in it is not told. A
+phantom that a thin neck joins to a person, be it of the hull itself, of the pixel that silhouettes
+are grown by, or of a cell, is of one volume with the person, and that is proved real, rightly; a
+contact with the phantom is then no contact with the person, and phantoms of litres were seen to be
+joined so. For a contact "real" is therefore an estimate, and only "unsure" is a warning. How far
+from a contact something real may be at most is bounded elsewhere (`hybridve.hull.contact.bulge`).
 
 The rectangle
 -------------
@@ -480,6 +489,8 @@ def _blocks(
 def is_real_at(hull: Hull, grown_hull: Hull, point_world: NDArray[np.float64]) -> bool:
     """Tell whether right silhouettes prove that what a point is part of holds something real.
 
+    Somewhere: not that the point itself is near it (see this file's head).
+
     Few of the proofs of `is_real`, but without volumes: the ray of a pixel that the point projects
     to must be in the hull in one stretch, and the way from the point to the ray in the hull, too.
 
@@ -511,7 +522,7 @@ def is_real_at(hull: Hull, grown_hull: Hull, point_world: NDArray[np.float64]) -
 
 
 def is_real(hull: Hull, volumes: Volumes, coverage: Coverage, volume: int) -> bool:
-    """Tell whether right silhouettes prove that a volume holds something real.
+    """Tell whether right silhouettes prove that a volume holds something real, somewhere in it.
 
     Points of the volume are projected. Where one falls on an object pixel in a block that no other
     volume covers, the pixel's ray is walked: it must be in the hull, and only in this volume.

@@ -7,8 +7,9 @@ a hull is: everything that could be there. Here stands how much. Each number is 
 * **exact**: cameras that see a point; whether a verdict stands without a camera;
 * **bound**, given right silhouettes (an object pixel's ray meets something real, and whatever is
   real lies in the hull of silhouettes grown by one pixel; see `hybridve.hull.contact.components`):
-  how far away the real thing is at most; that a volume holds something real;
-* **estimate**: the standard deviation of the clearance, and what it is at least at 95 %.
+  how far away the real thing is at most;
+* **estimate**: the standard deviation of the clearance, and what it is at least at 95 %; whether
+  what touches is real. That a volume holds something real is proved, but not where in it.
 
 What an outline does to the clearance
 -------------------------------------
@@ -279,10 +280,12 @@ class Doubt:
         stands if one of its known points does, a free object if it is certainly free: not within
         the meter's tolerance of the hull.
     component : "real", "unsure" or ""
-        Bound, given right silhouettes: "real" if the volume that touches or is nearest is proved to
-        hold something real; "unsure" if each pixel it explains is explained by another volume, too,
-        as of a phantom; "" where there is no volume, where it is farther away than cells are
-        looked for, or the object is too far away to be looked at closely.
+        Estimate: "real" if the volume that touches or is nearest is proved to hold something real,
+        given right silhouettes, somewhere: it may be a phantom where it touches, if a neck of the
+        hull, as thin as a cell, joins it to something real; "unsure" if each pixel it explains is
+        explained by another volume, too, as of a phantom; "" where there is no volume, where it is
+        farther away than cells are looked for, or the object is too far away to be looked at
+        closely.
     """
 
     std_m: float

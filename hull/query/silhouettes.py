@@ -111,7 +111,7 @@ def make_seen(
         mask_offset[camera] = sum(map(len, flat))
         integral_offset[camera] = sum(map(len, integrals))
         flat.append(seen.ravel())
-        integrals.append(cv2.integral(seen, sdepth=cv2.CV_32S).ravel())
+        integrals.append(np.asarray(cv2.integral(seen, sdepth=cv2.CV_32S), np.int32).ravel())
     if (mask_offset < 0).all():
         return None
     return Seen(np.concatenate(flat), mask_offset, np.concatenate(integrals), integral_offset)
