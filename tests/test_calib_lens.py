@@ -31,7 +31,7 @@ from hybridve.calib.pose import (
 )
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import undistort_mask
-from hybridve.hull.evaluate import rig_views
+from hybridve.hull.evaluate import moved_views, rig_views
 from hybridve.hull.query.bounds import FREE, verdicts
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Views, make_hull
@@ -322,6 +322,19 @@ def test_what_collides_where_cameras_carve_collides_where_they_abstain(model: st
         n_beyond += int(_are_beyond_gaps(hulls[1].views, points_world[carve]).sum())
     if make_camera("cam", model, POSE).has_distortion:
         assert n_beyond > 0  # a rectangle without gaps would lose them
+
+
+def test_views_of_all_frames_share_what_was_recorded() -> None:
+    """It is summed up once, however the cameras move."""
+    rig = Rig(tuple(make_camera(name, "OPENCV", POSE) for name in ("left", "right")))
+    session = _session("keep", 1)
+    first, lenses = rig_views(session, rig)
+    tracks: Any = SimpleNamespace(at=lambda index: {})  # a rig that moves: views of its own
+
+    later = moved_views(session, rig, tracks, 7, first, lenses)
+
+    assert later is not first
+    assert later.seen is first.seen is not None
 
 
 def _are_beyond_gaps(views: Views, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
