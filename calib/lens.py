@@ -27,7 +27,7 @@ _EXTENT_STEPS = 65
 _KIND = "lenses"
 
 #: Part of the key of what is kept: count it up when `undistortion` computes something else.
-_VERSION = 1
+_VERSION = 2
 
 
 def _colmap_camera(camera: Camera) -> pycolmap.Camera:
@@ -123,6 +123,11 @@ class Undistortion:
     map_x: NDArray[np.float32] | None
     map_y: NDArray[np.float32] | None
 
+    @property
+    def seen(self) -> NDArray[np.bool_] | None:
+        """Which pixels (height_px, width_px) were recorded; None for all of them."""
+        return None if self.map_x is None else self.map_x != -1
+
 
 def undistortion(camera: Camera) -> Undistortion:
     """Return the pinhole image that contains all that the camera sees, up to 70 degrees off axis.
@@ -144,56 +149,6 @@ def undistortion(camera: Camera) -> Undistortion:
     else:
         matrix, map_x, map_y = kept
     return Undistortion(map_x.shape[1], map_x.shape[0], matrix, map_x, map_y)
-
-
-def trimmed(whole: Undistortion) -> Undistortion:
-    """Return the part of a pinhole image, a rectangle, that the recorded image fills without a gap.
-
-    For cameras that abstain where they see nothing: a hull's camera sees all of its image. The
-    rectangle is shrunk from the whole, each time by the side with most gaps, and then grown as far
-    as it can; beyond any of its sides there is a gap or nothing.
-    """
-    if whole.map_x is None or whole.map_y is None:
-        return whole
-    gaps = np.zeros((whole.height_px + 1, whole.width_px + 1), np.int64)
-    gaps[1:, 1:] = (whole.map_x == -1).cumsum(axis=0).cumsum(axis=1)
-
-    def n_gaps(top: int, bottom: int, left: int, right: int) -> int:
-        count = gaps[bottom, right] - gaps[top, right] - gaps[bottom, left] + gaps[top, left]
-        return int(count)
-
-    # Sides as top, bottom, left, right; each with the line that it would lose, or win.
-    box = [0, whole.height_px, 0, whole.width_px]
-    steps = (1, -1, 1, -1)
-    while n_gaps(*box) and box[0] < box[1] and box[2] < box[3]:
-        shares = []
-        for side in range(4):
-            line = _line(box, side, inwards=True)
-            shares.append(n_gaps(*line) / ((line[1] - line[0]) * (line[3] - line[2])))
-        side = int(np.argmax(shares))
-        box[side] += steps[side]
-    for side, limit in enumerate((0, whole.height_px, 0, whole.width_px)):
-        while box[side] != limit and n_gaps(*_line(box, side, inwards=False)) == 0:
-            box[side] -= steps[side]
-    top, bottom, left, right = box
-    matrix = whole.img_from_cam.copy()
-    matrix[:2, 2] -= (left, top)
-    return Undistortion(
-        right - left,
-        bottom - top,
-        matrix,
-        np.ascontiguousarray(whole.map_x[top:bottom, left:right]),
-        np.ascontiguousarray(whole.map_y[top:bottom, left:right]),
-    )
-
-
-def _line(box: list[int], side: int, *, inwards: bool) -> list[int]:
-    """Return the row or column of a box (top, bottom, left, right) along a side, or beyond it."""
-    line = list(box)
-    first = side % 2 == 0
-    start = box[side] - (first != inwards)
-    line[side // 2 * 2], line[side // 2 * 2 + 1] = start, start + 1
-    return line
 
 
 def _is_undistortion(matrix: NDArray[Any], map_x: NDArray[Any], map_y: NDArray[Any]) -> bool:
@@ -245,5 +200,8 @@ def _undistort(
         1.0 + np.linalg.norm(rays_wanted[:, :2], axis=1)
     )
     maps = np.where(inside[:, None], sources - 0.5, -1.0).astype(np.float32)
+    # Rounded to single precision, a place at the far border of the image must stay before it.
+    last = np.array([camera.width_px, camera.height_px], np.float32) - np.float32(0.5)
+    maps = np.minimum(maps, np.nextafter(last, np.float32(0.0)))
     maps = maps.reshape(height_px, width_px, 2)
     return matrix, np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])

@@ -228,7 +228,8 @@ def _warnings(found: dict[str, Any]) -> list[str]:
         ),
         (
             found["frames_unsure"],
-            "what touches may hold nothing real: other volumes of the hull explain all its pixels",
+            "what touches may hold nothing real: other volumes of the hull explain all its pixels "
+            "(elsewhere its volume holds something real somewhere, perhaps not where it touches)",
         ),
     )
     lines = [f"in {options.counted(count, 'frame')} {text}" for count, text in told if count]

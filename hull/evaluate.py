@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
-from hybridve.calib.lens import Undistortion, trimmed, undistortion
+from hybridve.calib.lens import Undistortion, undistortion
 from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import rig_to_dict
@@ -51,7 +51,14 @@ from hybridve.hull.contact.respond import Response, ResponseSettings, respond
 from hybridve.hull.contact.scene import Scene
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
+from hybridve.hull.query.silhouettes import (
+    Hull,
+    Seen,
+    Views,
+    make_hull,
+    make_seen,
+    make_views,
+)
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.schema import FrameResult, Part
 
@@ -130,9 +137,11 @@ class Chain:
 def rig_views(session: Session, rig: Rig) -> tuple[Views, list[Undistortion]]:
     """Return the session's cameras as pinhole views, and how their images become so."""
     lenses = [undistortion(rig[camera.name]) for camera in session.cameras]
-    if session.unseen == "keep":  # gaps are background, but nobody saw them: no image, no gaps
-        lenses = [trimmed(lens) for lens in lenses]
-    return _lens_views(session, rig, lenses), lenses
+    seen = None
+    if session.unseen == "keep":  # where a lens leaves a gap in the pinhole image, nobody looked
+        names = tuple(camera.name for camera in session.cameras)
+        seen = make_seen(names, _sizes_px(lenses), [lens.seen for lens in lenses])
+    return _lens_views(session, rig, lenses, seen=seen), lenses
 
 
 def moved_views(
@@ -153,7 +162,7 @@ def moved_views(
     """
     if not tracks:
         return first
-    return _lens_views(session, rig.at(tracks.at(index)), lenses, first.origin_world)
+    return _lens_views(session, rig.at(tracks.at(index)), lenses, first.origin_world, first.seen)
 
 
 def _lens_views(
@@ -161,11 +170,12 @@ def _lens_views(
     rig: Rig,
     lenses: list[Undistortion],
     origin_world: NDArray[np.float64] | None = None,
+    seen: Seen | None = None,
 ) -> Views:
     cameras = [rig[camera.name] for camera in session.cameras]
     return make_views(
         tuple(camera.name for camera in cameras),
-        np.array([(lens.width_px, lens.height_px) for lens in lenses], np.int64),
+        _sizes_px(lenses),
         np.array(
             [
                 lens.img_from_cam @ camera.cam_from_world
@@ -175,7 +185,13 @@ def _lens_views(
         session.unseen,
         session.min_cameras,
         origin_world,
+        seen,
     )
+
+
+def _sizes_px(lenses: list[Undistortion]) -> NDArray[np.int64]:
+    """Return the sizes (C, 2) of the cameras' pinhole images: width, height."""
+    return np.array([(lens.width_px, lens.height_px) for lens in lenses], np.int64)
 
 
 def make_chain(

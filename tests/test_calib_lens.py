@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from hybridve.calib import lens
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.lens import cam_from_img, img_from_cam, project_points, trimmed, undistortion
+from hybridve.calib.lens import (
+    MAX_HALF_ANGLE_DEG,
+    cam_from_img,
+    img_from_cam,
+    project_points,
+    undistortion,
+)
 from hybridve.calib.pose import (
     angle_between,
     compose,
@@ -25,9 +31,10 @@ from hybridve.calib.pose import (
 )
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import undistort_mask
-from hybridve.hull.evaluate import rig_views
+from hybridve.hull.evaluate import moved_views, rig_views
+from hybridve.hull.query.bounds import FREE, verdicts
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import make_hull
+from hybridve.hull.query.silhouettes import Views, make_hull
 
 #: A pixel led to a ray and back, in pixels; COLMAP iterates to 1e-10 of a ray.
 ROUND_TRIP_PX = 1e-5
@@ -240,35 +247,111 @@ def test_a_rig_has_cameras_with_names_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("model", sorted(LENSES))
-def test_a_trimmed_image_has_no_gaps_and_cannot_grow(model: str) -> None:
-    whole = undistortion(make_camera("cam", model, POSE))
+def test_a_pixel_is_called_seen_just_where_the_recording_fills_it(model: str) -> None:
+    lens = undistortion(make_camera("cam", model, POSE))
 
-    part = trimmed(whole)
+    filled = undistort_mask(np.full((HEIGHT_PX, WIDTH_PX), 255, np.uint8), lens)
 
-    if whole.map_x is None or part.map_x is None or part.map_y is None:
-        assert part is whole
-        return
-    has_gap = whole.map_x == -1
-    assert (part.map_x != -1).all()
-    assert (part.map_y != -1).all()
-    # The same rays in the same pixels, shifted by whole ones.
-    shift = whole.img_from_cam[:2, 2] - part.img_from_cam[:2, 2]
-    left, top = np.round(shift).astype(int)
-    np.testing.assert_allclose(shift, (left, top), rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(part.img_from_cam[:, :2], whole.img_from_cam[:, :2])
-    bottom, right = top + part.height_px, left + part.width_px
-    np.testing.assert_array_equal(part.map_x, whole.map_x[top:bottom, left:right])
-    # A row or column more on any side would have a gap, or is not there.
-    padded = np.pad(has_gap, 1, constant_values=True)
-    for more in (
-        padded[top, left + 1 : right + 1],
-        padded[bottom + 1, left + 1 : right + 1],
-        padded[top + 1 : bottom + 1, left],
-        padded[top + 1 : bottom + 1, right + 1],
+    if lens.seen is None:
+        assert filled.all()
+    else:
+        np.testing.assert_array_equal(lens.seen, filled == 255)
+        assert not lens.seen.all()
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_all_that_was_recorded_is_seen_in_the_pinhole_image(model: str) -> None:
+    camera = make_camera("cam", model, POSE)
+    lens = undistortion(camera)
+    x, y = np.meshgrid(np.arange(1.5, WIDTH_PX - 1), np.arange(1.5, HEIGHT_PX - 1))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    rays = cam_from_img(camera, pixels)
+    # What a fisheye sees farther off the axis, and where a polynomial has turned back, is cut off.
+    limit = np.tan(np.deg2rad(MAX_HALF_ANGLE_DEG - 1.0))
+    kept = np.isfinite(rays).all(axis=1) & (np.abs(rays) < limit).all(axis=1)
+    again = img_from_cam(camera, np.column_stack([rays[kept], np.ones(kept.sum())]))
+    kept[kept] = np.linalg.norm(again - pixels[kept], axis=1) < ROUND_TRIP_PX
+    assert kept.mean() > 0.5
+
+    columns, rows = np.floor(rays[kept] @ lens.img_from_cam[:2, :2].T + lens.img_from_cam[:2, 2]).T
+
+    assert (
+        (columns >= 0) & (columns < lens.width_px) & (rows >= 0) & (rows < lens.height_px)
+    ).all()
+    if lens.seen is not None:
+        assert lens.seen[rows.astype(np.int64), columns.astype(np.int64)].all()
+
+
+def _session(unseen: str, min_cameras: int) -> Any:
+    names = [SimpleNamespace(name=name) for name in ("left", "right")]
+    return SimpleNamespace(cameras=names, unseen=unseen, min_cameras=min_cameras)
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_what_collides_where_cameras_carve_collides_where_they_abstain(model: str) -> None:
+    """Both cameras see such a point on an object pixel, so that `min_cameras` = 2 have seen it."""
+    rig = Rig(
+        (
+            make_camera("left", model, POSE),
+            make_camera("right", model, look_at((-0.9, -1.1, 0.8), (0.0, 0.0, 0.1), -20.0)),
+        )
+    )
+    rng = np.random.default_rng(sorted(LENSES).index(model))
+    points_world = rng.uniform(-1.2, 1.2, (4000, 3))
+    corners = points_world[:, None] + 0.004 * rng.normal(size=(4000, 3, 3))
+    x, y = np.meshgrid(np.arange(WIDTH_PX), np.arange(HEIGHT_PX))
+    disc = ((x - 300) ** 2 + (y - 240) ** 2 < 260**2).astype(np.uint8)  # reaches a border
+    full = np.ones_like(disc)
+    n_beyond = 0
+    for recorded in (full, disc):
+        hulls = []
+        for session in (_session("carve", 1), _session("keep", 2), _session("keep", 1)):
+            views, lenses = rig_views(session, rig)
+            hulls.append(make_hull(views, [undistort_mask(recorded, lens) for lens in lenses]))
+        carve, both, one = (contains_points(hull, points_world) for hull in hulls)
+
+        np.testing.assert_array_equal(carve, both)
+        assert (one | ~both).all()
+        assert carve.sum() > 100
+        assert (one & ~both).sum() > 100
+        for hull in hulls[1:]:
+            free = verdicts(hull, corners - hull.views.origin_world) == FREE
+            inside = contains_points(hull, corners.mean(axis=1))
+            assert not (free & inside).any()
+            assert free.any()
+        n_beyond += int(_are_beyond_gaps(hulls[1].views, points_world[carve]).sum())
+    if make_camera("cam", model, POSE).has_distortion:
+        assert n_beyond > 0  # a rectangle without gaps would lose them
+
+
+def test_views_of_all_frames_share_what_was_recorded() -> None:
+    """It is summed up once, however the cameras move."""
+    rig = Rig(tuple(make_camera(name, "OPENCV", POSE) for name in ("left", "right")))
+    session = _session("keep", 1)
+    first, lenses = rig_views(session, rig)
+    tracks: Any = SimpleNamespace(at=lambda index: {})  # a rig that moves: views of its own
+
+    later = moved_views(session, rig, tracks, 7, first, lenses)
+
+    assert later is not first
+    assert later.seen is first.seen is not None
+
+
+def _are_beyond_gaps(views: Views, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points lie beyond a gap from the middle of some camera's image."""
+    beyond = np.zeros(len(points_world), np.bool_)
+    for camera, (matrix, size_px) in enumerate(
+        zip(views.img_from_local, views.sizes_px, strict=True)
     ):
-        assert more.any()
-    # It holds the middle of the lens and most of what the camera sees.
-    assert part.map_x.size > 0.5 * (~has_gap).sum()
+        integral = views.seen_integral(camera)
+        if integral is not None:
+            h = (points_world - views.origin_world) @ matrix[:, :3].T + matrix[:, 3]
+            pixels = np.floor(h[:, :2] / h[:, 2:]).astype(np.int64)
+            x0, y0 = np.minimum(pixels, size_px // 2).T
+            x1, y1 = np.maximum(pixels, size_px // 2).T + 1
+            n_seen = integral[y1, x1] - integral[y0, x1] - integral[y1, x0] + integral[y0, x0]
+            beyond |= n_seen < (x1 - x0) * (y1 - y0)
+    return beyond
 
 
 def test_a_camera_that_abstains_does_not_carve_where_its_lens_shows_nothing() -> None:

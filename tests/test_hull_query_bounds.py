@@ -1,5 +1,7 @@
 """What the rectangle test proves, and that it proves enough."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.hulls import (
@@ -20,7 +22,7 @@ from hypothesis import strategies as st
 from hybridve.hull.query.bounds import FREE, FULL, OPEN, boxes_are_free, verdicts
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference, contains_points
-from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.query.silhouettes import Hull, make_hull, make_seen
 
 
 @st.composite
@@ -94,6 +96,27 @@ def test_a_camera_that_may_abstain_rejects_only_what_it_sees_whole() -> None:
     assert boxes_are_free(carve, -large, large).all()
     assert boxes_are_free(keep, -small, small).all()
     assert not boxes_are_free(keep, -large, large).any()
+    # Where all must see an object pixel, that it sees none is enough.
+    all_four = make_hull(ring_views(4, unseen="keep", min_cameras=4), masks)
+    assert boxes_are_free(all_four, -large, large).all()
+
+
+def test_a_box_that_a_camera_recorded_in_part_is_neither_rejected_nor_full() -> None:
+    empty, full = np.zeros((486, 720), np.uint8), np.ones((486, 720), np.uint8)
+    left_half = full.copy()
+    left_half[:, 360:] = 0
+    views = ring_views(4, unseen="keep", min_cameras=3)
+    views = replace(views, seen=make_seen(views.names, views.sizes_px, [left_half, *[None] * 3]))
+    hulls = [make_hull(views, [mask, full, full, full]) for mask in (empty, full)]
+    matrix = views.img_from_local[0]
+    across = np.linalg.solve(matrix[:, :3], np.array([1.0, 0.0, 0.0]))  # to the right of its image
+    across *= 0.2 / np.linalg.norm(across)
+    small = 0.01 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    boxes = np.stack([small - across, small, small + across])  # seen by it, in part, and not
+
+    found = [verdicts(hull, boxes - views.origin_world).tolist() for hull in hulls]
+
+    assert found == [[FREE, OPEN, FULL], [FULL, OPEN, FULL]]
 
 
 def test_what_too_few_cameras_can_see_is_free() -> None:

@@ -406,7 +406,7 @@ def test_only_the_vertices_of_a_mesh_that_moves_are_sent_again(compute: Compute)
     assert len(surface.placements) == 1
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, 2, 5, 7])
 def test_meshes_with_viewports_of_every_size_are_sampled_alike(compute: Compute, seed: int) -> None:
     scenes = [random_scene(seed, n) for n in (200, 130)]
     hull = scenes[0][0]

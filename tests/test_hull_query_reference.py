@@ -1,12 +1,14 @@
 """The specification of inside, on cameras small enough to be worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hybridve.hull.query import reference
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.reference import Reference, contains_points
-from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull
+from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull, make_seen
 
 #: Looks along +z from the origin; a point (x, y, 1) projects to pixel (x, y).
 ALONG_Z = np.eye(3, 4)
@@ -102,6 +104,32 @@ def test_a_camera_that_cannot_see_a_point_carves_or_abstains(
     hull = small_hull(masks, unseen, min_cameras)
 
     assert contains_points(hull, point).tolist() == [inside]
+
+
+@pytest.mark.parametrize(
+    ("min_cameras", "masks", "x", "inside"),
+    [
+        (1, [[[1, 0, 0]], [[1, 1, 1]]], 0.5, True),
+        (1, [[[1, 0, 0]], [[1, 1, 1]]], 1.5, False),  # background
+        (1, [[[1, 0, 0]], [[1, 1, 1]]], 2.5, True),  # a did not record this pixel, and b saw it
+        (2, [[[1, 0, 0]], [[1, 1, 1]]], 2.5, False),  # which is one camera
+        (2, [[[1, 0, 0]], [[1, 1, 1]]], 0.5, True),
+        (1, [[[1, 1, 1]], [[0, 0, 0]]], 2.5, False),
+        (1, [[[1, 1, 1]], [[0, 0, 0]]], 1.5, False),
+        (1, [[[0, 0, 1]], [[1, 1, 1]]], 2.5, True),  # whatever stands in its silhouette there
+        (2, [[[0, 0, 1]], [[1, 1, 1]]], 2.5, False),
+    ],
+)
+def test_a_camera_abstains_on_a_pixel_that_it_did_not_record(
+    min_cameras: int, masks: list[list[list[int]]], x: float, inside: bool
+) -> None:
+    hull = small_hull(masks, "keep", min_cameras)
+    recorded = np.array([[True, True, False]])
+    seen = make_seen(hull.views.names, hull.views.sizes_px, [recorded, None])
+    hull = make_hull(replace(hull.views, seen=seen), [np.array(mask, np.uint8) for mask in masks])
+    half_way = np.array([[5 * x, 2.5, 5.0]])  # pixels of both are 5 m wide there
+
+    assert contains_points(hull, half_way).tolist() == [inside]
 
 
 def test_no_points_are_no_answers() -> None:

@@ -1,10 +1,20 @@
 """Cameras and silhouettes as the engines take them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.hulls import look_at, projection, ring_views
 
-from hybridve.hull.query.silhouettes import make_hull, make_views
+from hybridve.hull.query.silhouettes import (
+    BACKGROUND,
+    OBJECT,
+    UNSEEN,
+    interpolated_views,
+    make_hull,
+    make_seen,
+    make_views,
+)
 
 
 def ring_matrices(n_cameras: int, target: np.ndarray, distance_m: float = 3.0) -> np.ndarray:
@@ -116,3 +126,82 @@ def test_masks_that_are_not_of_the_cameras_are_refused() -> None:
         ValueError, match=r"camera cam1 has shape \(720, 486\), expected \(486, 720\)"
     ):
         make_hull(views, [mask, mask.T])
+
+
+def test_what_was_recorded_is_kept_of_the_cameras_that_have_gaps_only() -> None:
+    sizes = np.array([[3, 2], [2, 2], [4, 1]])
+    second, third = np.array([[1, 0], [1, 1]]), np.array([[0, 0, 255, 7]])
+
+    seen = make_seen(NAMES, sizes, [None, second.astype(np.uint8), third.astype(np.uint8)])
+
+    assert seen is not None
+    assert seen.masks_flat.tolist() == [1, 0, 1, 1, 0, 0, 1, 1]
+    assert seen.mask_offset.tolist() == [-1, 0, 4]
+    views = make_views(NAMES, sizes, ring_matrices(3, np.zeros(3)), "keep", seen=seen)
+    assert views.seen_mask(0) is None
+    assert views.seen_integral(0) is None
+    integral = views.seen_integral(2)
+    assert integral is not None
+    assert integral.tolist() == [[0, 0, 0, 0, 0], [0, 0, 0, 1, 2]]
+    # Of fewer cameras, in another order: the same images.
+    fewer = replace(
+        views,
+        names=("c", "a"),
+        sizes_px=sizes[[2, 0]],
+        img_from_local=views.img_from_local[[2, 0]],
+        seen=seen.of(np.array([2, 0])),
+    )
+    mask = fewer.seen_mask(0)
+    assert mask is not None
+    assert mask.tolist() == [[0, 0, 1, 1]]
+    assert fewer.seen_mask(1) is None
+
+
+def test_cameras_without_gaps_have_nothing_to_remember() -> None:
+    full = [np.ones((480, 640), np.bool_), None, np.ones((480, 640), np.bool_)]
+
+    assert make_seen(NAMES, SIZES, full) is None
+
+
+def test_what_was_recorded_must_fit_the_cameras() -> None:
+    with pytest.raises(ValueError, match="2 masks of what was seen for 3 cameras"):
+        make_seen(NAMES, SIZES, [None, None])
+    with pytest.raises(ValueError, match=r"camera b saw has shape \(2, 2\), expected \(480, 640\)"):
+        make_seen(NAMES, SIZES, [None, np.ones((2, 2), np.bool_), None])
+
+
+def test_cameras_that_carve_have_no_gaps() -> None:
+    seen = make_seen(NAMES, SIZES, [np.zeros((480, 640), np.bool_), None, None])
+    views = make_views(NAMES, SIZES, ring_matrices(3, np.zeros(3)), "keep", seen=seen)
+
+    assert make_views(NAMES, SIZES, ring_matrices(3, np.zeros(3)), "carve", seen=seen).seen is None
+    with pytest.raises(ValueError, match="carve"):
+        replace(views, unseen="carve")
+
+
+def test_a_pixel_that_was_not_recorded_is_neither_object_nor_background() -> None:
+    sizes = np.array([[3, 1]] * 3)
+    recorded = np.array([[1, 1, 0]], np.bool_)
+    seen = make_seen(NAMES, sizes, [recorded, None, None])
+    views = make_views(NAMES, sizes, ring_matrices(3, np.zeros(3)), "keep", seen=seen)
+
+    hull = make_hull(views, [np.array([[0, 9, 9]], np.uint8)] * 3)
+
+    assert hull.answers(0).tolist() == [[BACKGROUND, OBJECT, UNSEEN]]
+    assert hull.mask(0).tolist() == [[0, 1, 0]]
+    assert hull.integral(0)[-1].tolist() == [0, 0, 1, 1]
+    assert hull.answers(1).tolist() == [[BACKGROUND, OBJECT, OBJECT]]
+
+
+def test_views_between_two_frames_are_of_cameras_that_recorded_the_same() -> None:
+    gaps = np.ones((480, 640), np.bool_)
+    gaps[:9] = False
+    matrices = ring_matrices(3, np.zeros(3))
+    some, same = (make_seen(NAMES, SIZES, [gaps, None, None]) for _ in range(2))
+    other = make_seen(NAMES, SIZES, [~gaps, None, None])
+    before = make_views(NAMES, SIZES, matrices, "keep", seen=some)
+
+    assert interpolated_views(before, replace(before, seen=same), 0.5).seen is some
+    for different in (other, None):
+        with pytest.raises(ValueError, match="not of the same"):
+            interpolated_views(before, replace(before, seen=different), 0.5)

@@ -1,5 +1,6 @@
 """Rays through hulls small enough to be worked out by hand, and the directions of outlines."""
 
+from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 
@@ -9,7 +10,14 @@ from helpers.hulls import ball_hull, look_at, projection, ring_views
 from helpers.response import angle_deg, camera_center, random_unit
 from numpy.typing import NDArray
 
-from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull, make_views
+from hybridve.hull.query.silhouettes import (
+    Hull,
+    Unseen,
+    Views,
+    make_hull,
+    make_seen,
+    make_views,
+)
 from hybridve.hull.query.walk import boundary_cameras, silhouette_normal, spans_in_hull
 
 #: Looks along +z from the origin; a point (x, y, 1) projects to pixel (x, y).
@@ -92,6 +100,44 @@ def test_another_camera_carves_where_it_sees_nothing_unless_it_abstains() -> Non
     np.testing.assert_allclose(carved, [[5, 10]])
     np.testing.assert_allclose(kept, [[5, 10], [20, 25]])
     np.testing.assert_allclose(both, [[5, 10]])
+
+
+def with_recorded(hull: Hull, *recorded: list[list[int]] | None) -> Hull:
+    """Return the hull of cameras that recorded these pixels of their images, or all."""
+    masks = [None if mask is None else np.array(mask, np.uint8) for mask in recorded]
+    seen = make_seen(hull.views.names, hull.views.sizes_px, masks)
+    cameras = range(len(hull.views))
+    return make_hull(replace(hull.views, seen=seen), [hull.mask(camera) for camera in cameras])
+
+
+def test_a_camera_abstains_along_a_ray_where_it_recorded_nothing() -> None:
+    masks = [[[0, 1, 1, 0, 1]], [[1, 1, 0]]]
+    start = np.array([0.0, 0.5, 5.0])  # both are 5 m away: pixels are 5 m wide
+    recorded = [[0, 1, 0, 0, 1]], [[1, 1, 0]]  # b did not record what was background to it
+
+    kept, both = (
+        spans_in_hull(with_recorded(small_hull(masks, "keep", least), *recorded), start, X, 90.0)
+        for least in (1, 2)
+    )
+
+    np.testing.assert_allclose(kept, [[0, 10], [20, 25]])
+    np.testing.assert_allclose(both, [[5, 10]])
+
+
+def test_the_end_of_what_a_camera_recorded_ends_the_hull_where_too_few_are_left() -> None:
+    masks = [[[1, 1, 1, 1, 1]], [[1, 1, 1, 1, 1]]]
+    start = np.array([0.0, 0.5, 5.0])
+    hulls = [
+        with_recorded(small_hull(masks, "keep", least), [[1, 1, 0, 0, 0]], None) for least in (1, 2)
+    ]
+
+    ends = [spans_in_hull(hull, start, X, 90.0)[-1, 1] for hull in hulls]
+
+    assert ends == [25.0, 10.0]
+    points = [start + end * X for end in ends]
+    assert boundary_cameras(hulls[0], points[0], X) == (1,)
+    assert boundary_cameras(hulls[1], points[1], X) == (0,)
+    assert boundary_cameras(hulls[0], points[1], X) == ()
 
 
 @pytest.mark.parametrize("reach_m", [0.0, -1.0, np.nan, np.inf])
@@ -344,6 +390,32 @@ def test_an_outline_goes_on_beyond_the_border_of_a_camera_that_abstains() -> Non
         turned.append(angle_deg(normal, truth / np.linalg.norm(truth)))
 
     assert turned[1] < 15 < turned[0]
+
+
+def test_an_outline_goes_on_where_a_camera_recorded_nothing() -> None:
+    """An upright outline; below it, and beside, the camera recorded nothing."""
+    views = one_camera(np.random.default_rng(4), "keep")
+    mask = np.zeros((70, 90), np.uint8)
+    mask[:, :45] = 1
+    recorded = np.ones((70, 90), np.uint8)
+    recorded[36:] = recorded[:, 48:] = 0
+    hulls = [
+        make_hull(replace(views, seen=make_seen(views.names, views.sizes_px, [pixels])), [mask])
+        for pixels in (None, recorded, 0 * recorded)
+    ]
+    matrix = views.img_from_local[0]
+    points_world = [
+        np.linalg.solve(matrix[:, :3], 2.0 * np.array([45.0, y, 1]) - matrix[:, 3])
+        + views.origin_world
+        for y in (34.5, 36.5)
+    ]
+
+    normals = [silhouette_normal(hull, 0, points_world[0]) for hull in hulls]
+
+    np.testing.assert_array_equal(normals[1], normals[0])
+    assert np.isnan(normals[2]).all()
+    assert np.isnan(silhouette_normal(hulls[1], 0, points_world[1])).all()
+    assert np.isfinite(silhouette_normal(hulls[0], 0, points_world[1])).all()
 
 
 @pytest.mark.parametrize("is_hole", [False, True])

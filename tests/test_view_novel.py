@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import moderngl
 import numpy as np
 import pytest
-from helpers.hulls import ball_hull, random_masks, random_views, ring_views
+from helpers.hulls import ball_hull, random_masks, random_views, ring_views, with_gaps
 from numpy.typing import NDArray
 
 from hybridve.hull.query.device import open_device
@@ -120,7 +120,10 @@ def test_any_hull_is_found_where_the_specification_finds_it(
     for seed in range(8):
         rng = np.random.default_rng(seed)
         n_cameras = int(rng.integers(2, 6))
-        views = random_views(rng, n_cameras, unseen, int(rng.integers(1, n_cameras + 1)))
+        min_cameras = int(rng.integers(1, n_cameras + 1))
+        views = random_views(rng, n_cameras, unseen, min_cameras, gaps=False)
+        if unseen == "keep" and seed % 2:
+            views = with_gaps(np.random.default_rng([1, seed]), views)
         kinds = ["blobs", *rng.choice(["blobs", "holes", "noise", "half"], n_cameras - 1)]
         hull = make_hull(views, random_masks(rng, views, kinds))
         direction = rng.normal(size=3)

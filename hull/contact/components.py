@@ -14,7 +14,16 @@ pixel (`grown`). That holds whatever is real, if it is not thinner than a pixel.
 Volumes are connected cells: space is cut into cubes, coarse to fine, and a cube is kept unless one
 camera sees no object pixel in the rectangle around its projection. What is connected in the hull
 is connected in cells, so volumes that are told apart are apart; two that come nearer to each other
-than some two cells may be told as one, which can make a phantom part of something real.
+than some two cells may be told as one.
+
+What "real" says, and what not
+------------------------------
+The proof is of a volume as a whole: somewhere in it is something real. Where in it is not told. A
+phantom that a thin neck joins to a person, be it of the hull itself, of the pixel that silhouettes
+are grown by, or of a cell, is of one volume with the person, and that is proved real, rightly; a
+contact with the phantom is then no contact with the person, and phantoms of litres were seen to be
+joined so. For a contact "real" is therefore an estimate, and only "unsure" is a warning. How far
+from a contact something real may be at most is bounded elsewhere (`hybridve.hull.contact.bulge`).
 
 The rectangle
 -------------
@@ -215,6 +224,7 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
             np.ascontiguousarray(hull.views.sizes_px),
             hull.integrals_flat,
             hull.integral_offset,
+            None if hull.views.seen is None else hull.recorded_offset,
             hull.views.unseen == "keep",
             int(hull.views.min_cameras),
         )
@@ -238,6 +248,7 @@ def _tell(
     sizes: NDArray[np.int64],
     integrals: NDArray[np.int32],
     integral_offset: NDArray[np.int64],
+    recorded: NDArray[np.int64] | None,
     keep: bool,
     min_cameras: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -246,9 +257,9 @@ def _tell(
     is_full = np.zeros(len(centers_local), np.bool_)
     for i in range(len(centers_local)):
         x, y, z = centers_local[i]
-        n_seeing, n_full, n_none = ZERO, ZERO, ZERO
+        n_seeing, n_full, n_none, n_object = ZERO, ZERO, ZERO, ZERO
         for camera in range(len(matrices)):
-            seen, full, none = _look(
+            seen, full, none, has_object = _look(
                 x,
                 y,
                 z,
@@ -259,14 +270,17 @@ def _tell(
                 integrals,
                 integral_offset[camera],
                 keep,
+                camera,
+                recorded,
             )
             n_seeing += seen
             n_full += full
+            n_object += has_object
             n_none += none or not (seen or keep)
             if n_none:
                 break
         needed = min_cameras if keep else len(matrices)
-        is_free[i] = n_none > 0 or n_seeing < needed
+        is_free[i] = n_none > 0 or n_object < needed
         is_full[i] = not is_free[i] and n_full == n_seeing
     return is_free, is_full
 
@@ -283,15 +297,17 @@ def _look(
     integrals: NDArray[np.int32],
     first: int,
     keep: bool,
-) -> tuple[bool, bool, bool]:
-    """Tell of a cube: a camera may see it; sees object only; sees background only."""
+    camera: int,
+    recorded: NDArray[np.int64] | None,
+) -> tuple[bool, bool, bool, bool]:
+    """Tell of a cube: a camera may see it; sees object only; background only; some object."""
     depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
     thick_m = half_m * (abs(m[2, 0]) + abs(m[2, 1]) + abs(m[2, 2]))
     if depth_m + thick_m <= -_NEAR_M:
-        return False, False, False
+        return False, False, False, False
     if depth_m - thick_m <= _NEAR_M:  # it straddles the camera's plane, and projects anywhere
         if not _may_be_seen(x, y, z, half_m, m, width, height):
-            return False, False, False
+            return False, False, False, False
         x0, x1, y0, y1 = 0, width, 0, height
         is_seen_wholly = False
     else:
@@ -299,20 +315,33 @@ def _look(
         left, right = _interval(x, y, z, m[0], m[2], per_depth, scale)
         top, bottom = _interval(x, y, z, m[1], m[2], per_depth, scale)
         if right < 0 or bottom < 0 or left >= width or top >= height:
-            return False, False, False
+            return False, False, False, False
         is_seen_wholly = left >= 0 and top >= 0 and right < width and bottom < height
         x0, x1 = int(max(left, 0.0)), int(min(right + 1.0, float(width)))
         y0, y1 = int(max(top, 0.0)), int(min(bottom + 1.0, float(height)))
-    above, below = first + y0 * (width + 1), first + y1 * (width + 1)
+    above, below = y0 * (width + 1), y1 * (width + 1)
+    area = (x1 - x0) * (y1 - y0)
+    if recorded is not None:  # not compiled where it is
+        start = recorded[camera]
+        if start >= 0:
+            n_seen = (
+                integrals[start + below + x1]
+                - integrals[start + above + x1]
+                - integrals[start + below + x0]
+                + integrals[start + above + x0]
+            )
+            if n_seen == 0:
+                return False, False, False, False
+            is_seen_wholly = is_seen_wholly and n_seen == area
     count = (
-        integrals[below + x1]
-        - integrals[above + x1]
-        - integrals[below + x0]
-        + integrals[above + x0]
+        integrals[first + below + x1]
+        - integrals[first + above + x1]
+        - integrals[first + below + x0]
+        + integrals[first + above + x0]
     )
-    # Beyond its border a camera that keeps abstains.
+    # Beyond its border, and where it recorded nothing, a camera that keeps abstains.
     sees_none = count == 0 and (is_seen_wholly or not keep)
-    return True, is_seen_wholly and count == (x1 - x0) * (y1 - y0), sees_none
+    return True, is_seen_wholly and count == area, sees_none, count > 0
 
 
 @inlined
@@ -460,6 +489,8 @@ def _blocks(
 def is_real_at(hull: Hull, grown_hull: Hull, point_world: NDArray[np.float64]) -> bool:
     """Tell whether right silhouettes prove that what a point is part of holds something real.
 
+    Somewhere: not that the point itself is near it (see this file's head).
+
     Few of the proofs of `is_real`, but without volumes: the ray of a pixel that the point projects
     to must be in the hull in one stretch, and the way from the point to the ray in the hull, too.
 
@@ -491,7 +522,7 @@ def is_real_at(hull: Hull, grown_hull: Hull, point_world: NDArray[np.float64]) -
 
 
 def is_real(hull: Hull, volumes: Volumes, coverage: Coverage, volume: int) -> bool:
-    """Tell whether right silhouettes prove that a volume holds something real.
+    """Tell whether right silhouettes prove that a volume holds something real, somewhere in it.
 
     Points of the volume are projected. Where one falls on an object pixel in a block that no other
     volume covers, the pixel's ray is walked: it must be in the hull, and only in this volume.

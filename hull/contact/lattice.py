@@ -403,10 +403,10 @@ def bound_cells(
     """
     frame = asked.frame
     offset_x, offset_y, offset_z = asked.offset_local
-    matrices, sizes, masks, mask_offset = (
+    matrices, sizes, answers, mask_offset = (
         frame.matrices,
         frame.sizes,
-        frame.masks,
+        frame.answers,
         frame.mask_offset,
     )
     keep, min_cameras = frame.keep, frame.min_cameras
@@ -472,7 +472,7 @@ def bound_cells(
                     z + along * to_z + offset_z,
                     matrices,
                     sizes,
-                    masks,
+                    answers,
                     mask_offset,
                     keep,
                     min_cameras,

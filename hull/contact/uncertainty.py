@@ -7,8 +7,9 @@ a hull is: everything that could be there. Here stands how much. Each number is 
 * **exact**: cameras that see a point; whether a verdict stands without a camera;
 * **bound**, given right silhouettes (an object pixel's ray meets something real, and whatever is
   real lies in the hull of silhouettes grown by one pixel; see `hybridve.hull.contact.components`):
-  how far away the real thing is at most; that a volume holds something real;
-* **estimate**: the standard deviation of the clearance, and what it is at least at 95 %.
+  how far away the real thing is at most;
+* **estimate**: the standard deviation of the clearance, and what it is at least at 95 %; whether
+  what touches is real. That a volume holds something real is proved, but not where in it.
 
 What an outline does to the clearance
 -------------------------------------
@@ -83,7 +84,7 @@ from hybridve.hull.contact.components import (
 )
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.query.silhouettes import BACKGROUND, UNSEEN, Hull, Views
 from hybridve.hull.query.walk import silhouette_normal
 
 #: One-sided 95 % of a normal distribution, in standard deviations.
@@ -279,10 +280,12 @@ class Doubt:
         stands if one of its known points does, a free object if it is certainly free: not within
         the meter's tolerance of the hull.
     component : "real", "unsure" or ""
-        Bound, given right silhouettes: "real" if the volume that touches or is nearest is proved to
-        hold something real; "unsure" if each pixel it explains is explained by another volume, too,
-        as of a phantom; "" where there is no volume, where it is farther away than cells are
-        looked for, or the object is too far away to be looked at closely.
+        Estimate: "real" if the volume that touches or is nearest is proved to hold something real,
+        given right silhouettes, somewhere: it may be a phantom where it touches, if a neck of the
+        hull, as thin as a cell, joins it to something real; "unsure" if each pixel it explains is
+        explained by another volume, too, as of a phantom; "" where there is no volume, where it is
+        farther away than cells are looked for, or the object is too far away to be looked at
+        closely.
     """
 
     std_m: float
@@ -455,6 +458,7 @@ class FrameDoubts:
         return replace(
             self.hull,
             masks_flat=np.concatenate([self.hull.masks_flat, self.grown.masks_flat]),
+            answers_flat=np.concatenate([self.hull.answers_flat, self.grown.answers_flat]),
             integrals_flat=np.concatenate([self.hull.integrals_flat, self.grown.integrals_flat]),
         )
 
@@ -522,7 +526,13 @@ def _count_seeing(views: Views, point_world: NDArray[np.float64]) -> int:
     projected = views.img_from_local @ np.append(point_world - views.origin_world, 1.0)  # (C, 3)
     depth_m = projected[:, 2:]
     seen = (depth_m > 0) & (projected[:, :2] >= 0) & (projected[:, :2] < views.sizes_px * depth_m)
-    return int(seen.all(axis=1).sum())
+    n_seeing = 0
+    for camera in np.flatnonzero(seen.all(axis=1)):
+        recorded = views.seen_mask(int(camera))
+        pixel = (projected[camera, :2] / depth_m[camera]).astype(np.int64)
+        column, row = np.minimum(pixel, views.sizes_px[camera] - 1)  # division may round up
+        n_seeing += recorded is None or bool(recorded[row, column])
+    return n_seeing
 
 
 def without_camera(hull: Hull, camera: int) -> Hull:
@@ -546,12 +556,14 @@ def without_camera(hull: Hull, camera: int) -> Hull:
         views.origin_world,
         views.unseen,
         min(views.min_cameras, len(rest)),
+        None if views.seen is None else views.seen.of(rest),
     )
     return replace(
         hull,
         views=fewer,
         mask_offset=hull.mask_offset[rest],
         integral_offset=hull.integral_offset[rest],
+        recorded_offset=hull.recorded_offset[rest],
     )
 
 
@@ -639,14 +651,16 @@ def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64
     if not projected[2] > 0:
         return False
     x, y = projected[:2] / projected[2]
-    mask = hull.mask(camera)
-    height, width = mask.shape
+    answers = hull.answers(camera)
+    height, width = answers.shape
     if not (0 <= x < width and 0 <= y < height):
         return False
     most = int(_NEAR_PX) + 1
     column, row = int(x), int(y)
+    if answers[row, column] == UNSEEN:
+        return False
     if most <= column < width - most and most <= row < height - most:
-        around = mask[row - most : row + most + 1, column - most : column + most + 1]
+        around = answers[row - most : row + most + 1, column - most : column + most + 1]
         if around.all():  # most often
             return False
     reach = np.arange(-most, most + 1)
@@ -656,7 +670,7 @@ def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64
     away_y = np.maximum(np.maximum(rows - y, y - rows - 1), 0.0)
     is_near = away_x**2 + away_y[:, None] ** 2 <= _NEAR_PX**2
     is_within = (columns >= 0) & (columns < width) & ((rows >= 0) & (rows < height))[:, None]
-    value = mask[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)]
+    value = answers[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)]
     beyond_ends = views.unseen == "carve"
-    is_background = np.where(is_within, value == 0, beyond_ends)
+    is_background = np.where(is_within, value == BACKGROUND, beyond_ends)
     return bool((is_near & is_background).any())

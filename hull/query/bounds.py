@@ -11,7 +11,10 @@ All: it sees one at every point. The rectangles of all cameras together give a v
 * `OPEN`: look closer.
 
 A camera that may abstain (``unseen = "keep"``) rejects only where the rectangle lies wholly inside
-its image: beyond the border it says nothing.
+its image and holds no pixel but recorded ones, which four look-ups in another integral image count:
+beyond these it says nothing. Where it sees no object pixel in a rectangle that it does not see
+whole, it *withholds*: whatever point of the set it does not reject, it does not see. So the set is
+free as well where fewer than ``min_cameras`` cameras do see an object pixel.
 
 Why rounding cannot turn the proof into a guess
 -----------------------------------------------
@@ -151,22 +154,34 @@ def _chunk_verdicts(
     stop = np.clip(last + 1, 0, sizes_px).astype(np.int64)
     never_seen = behind | (stop <= start).any(axis=-1)
     stop = np.maximum(stop, start)
-    count = np.zeros(in_front.shape, np.int64)
+    area = (stop - start).prod(axis=-1)
+    count, n_seen = np.zeros(in_front.shape, np.int64), area.copy()
     for camera in range(len(views)):
-        integral = hull.integral(camera)
-        (x0, y0), (x1, y1) = start[:, camera].T, stop[:, camera].T
-        count[:, camera] = integral[y1, x1] - integral[y0, x1] - integral[y1, x0] + integral[y0, x0]
+        count[:, camera] = _count(hull.integral(camera), start[:, camera], stop[:, camera])
+        seen_integral = views.seen_integral(camera)
+        if seen_integral is not None:
+            n_seen[:, camera] = _count(seen_integral, start[:, camera], stop[:, camera])
+    wholly_seen &= n_seen == area
+    never_seen |= n_seen == 0
 
-    accepts = wholly_seen & (count == (stop - start).prod(axis=-1))
+    accepts = wholly_seen & (count == area)
     if views.unseen == "keep":
         rejects = wholly_seen & (count == 0)
-        may_see = (~never_seen).sum(axis=1)
+        may_see = (~never_seen & (count > 0)).sum(axis=1)  # others withhold
         free = rejects.any(axis=1) | (may_see < views.min_cameras)
         full = (accepts | never_seen).all(axis=1) & (accepts.sum(axis=1) >= views.min_cameras)
     else:
         free = (never_seen | (count == 0)).any(axis=1)
         full = accepts.all(axis=1)
     return np.where(free, FREE, np.where(full, FULL, OPEN)).astype(np.int8)
+
+
+def _count(
+    integral: NDArray[np.int32], start: NDArray[np.int64], stop: NDArray[np.int64]
+) -> NDArray[np.int32]:
+    """Return how many pixels an integral image counts in rectangles, from (N, 2) to (N, 2)."""
+    (x0, y0), (x1, y1) = start.T, stop.T
+    return np.asarray(integral[y1, x1] - integral[y0, x1] - integral[y1, x0] + integral[y0, x0])
 
 
 def boxes_are_free(

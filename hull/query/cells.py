@@ -1,8 +1,12 @@
 """Cells of space in the hull's sight: cubes that are cut into eight, and what is proved of each.
 
 A cube is *free* where the rectangle that it projects into holds no object pixel in some camera:
-then no point of it is in the hull. The argument is that of `hybridve.hull.query.bounds`, with
-another rectangle, which spares the projection of eight corners. Let p be the pixel of the cube's
+then no point of it is in the hull. A camera that may abstain must see all of the rectangle for
+that. Where it sees a part, without an object pixel, it can support no point of the cube, and the
+cube is free as well once fewer than ``min_cameras`` cameras can. (Without this, cubes astride the
+border of what a camera sees would stay open however small they are, and all along that border.)
+The argument is that of `hybridve.hull.query.bounds`, with another rectangle, which spares the
+projection of eight corners. Let p be the pixel of the cube's
 centre, h half of its edge, P the projection matrix, w the depth of the centre, and x = center + d
 with |d_j| <= h. Then the pixel of x is off p, along the image's rows, by
 
@@ -27,8 +31,14 @@ from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.clusters import make_frame
-from hybridve.hull.query.rectangles import ACCEPTS, REJECTS, UNDECIDED, Frame, rectangle_vote
-from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.rectangles import (
+    ACCEPTS,
+    REJECTS,
+    UNDECIDED,
+    Frame,
+    rectangle_vote,
+)
+from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, Hull
 
 _PAD = 40.0 * 2.0**-53
 
@@ -76,7 +86,7 @@ def is_inside(
     z: float,
     matrices: NDArray[np.float64],
     sizes: NDArray[np.int64],
-    masks: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     mask_offset: NDArray[np.int64],
     keep: bool,
     min_cameras: int,
@@ -95,10 +105,12 @@ def is_inside(
                 if (
                     not _EDGE_PX < pixel_x - column < 1.0 - _EDGE_PX
                     or not _EDGE_PX < pixel_y - row < 1.0 - _EDGE_PX
-                    or not masks[mask_offset[camera] + row * width + column]
                 ):
                     return False
-                n_seen += 1
+                answer = answers[mask_offset[camera] + row * width + column]
+                if answer == BACKGROUND:
+                    return False
+                n_seen += answer == OBJECT
                 continue
         if not keep:
             return False
@@ -117,7 +129,7 @@ def are_inside(points: NDArray[np.float64], asked: CellFrame) -> NDArray[np.bool
             points[i, 2] + offset[2],
             frame.matrices,
             frame.sizes,
-            frame.masks,
+            frame.answers,
             frame.mask_offset,
             frame.keep,
             frame.min_cameras,
@@ -189,7 +201,8 @@ def split_cells(
     frame, pads = asked.frame, asked.pads
     offset_x, offset_y, offset_z = asked.offset_local
     matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
-    masks, mask_offset, integral_offset = frame.masks, frame.mask_offset, frame.integral_offset
+    answers, mask_offset = frame.answers, frame.mask_offset
+    integral_offset = frame.integral_offset
     keep, min_cameras, n_cameras = frame.keep, frame.min_cameras, len(frame.matrices)
     whole = np.zeros(8 * len(center), np.int64)
     part_center = np.zeros((8 * len(center), 3))
@@ -257,6 +270,8 @@ def split_cells(
                     integral_offset[camera],
                     integrals,
                     keep,
+                    camera,
+                    frame.recorded,
                 )
                 if vote == REJECTS:
                     is_free = True
@@ -272,7 +287,7 @@ def split_cells(
             part_center[n_parts, 1] = cell_y
             part_center[n_parts, 2] = cell_z
             inside[n_parts] = is_inside(
-                x, y, z, matrices, sizes, masks, mask_offset, keep, min_cameras
+                x, y, z, matrices, sizes, answers, mask_offset, keep, min_cameras
             )
             n_parts += 1
     return whole[:n_parts], part_center[:n_parts], inside[:n_parts]

@@ -42,9 +42,10 @@ from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.clusters import make_frame, make_shares
 from hybridve.hull.query.engine import Closing, Triangles
 from hybridve.hull.query.rectangles import (
+    ABSTAINS,
     ACCEPTS,
     REJECTS,
-    UNDECIDED,
+    WITHHOLDS,
     Frame,
     Surface,
     Tree,
@@ -54,7 +55,7 @@ from hybridve.hull.query.rectangles import (
     triangle_rectangles,
 )
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, Hull
 from hybridve.hull.query.threads import Threads
 
 #: Verdicts.
@@ -208,7 +209,7 @@ def _is_inside(
     n_accept: int,
     matrices: NDArray[np.float64],
     sizes: NDArray[np.int64],
-    masks: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     mask_offset: NDArray[np.int64],
     keep: bool,
     min_cameras: int,
@@ -224,9 +225,10 @@ def _is_inside(
             pixel_x = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth_m
             pixel_y = (m[4] * x + m[5] * y + m[6] * z + m[7]) / depth_m
             if 0 <= pixel_x < width and 0 <= pixel_y < height:
-                if not masks[mask_offset[camera] + int(pixel_y) * width + int(pixel_x)]:
+                answer = answers[mask_offset[camera] + int(pixel_y) * width + int(pixel_x)]
+                if answer == BACKGROUND:
                     return False
-                n_seen += 1
+                n_seen += answer == OBJECT
                 continue
         if not keep:
             return False
@@ -271,7 +273,8 @@ def _certify_triangle(
         The longest edge of a cell that ended open.
     """
     matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
-    masks, mask_offset, integral_offset = frame.masks, frame.mask_offset, frame.integral_offset
+    answers, mask_offset = frame.answers, frame.mask_offset
+    integral_offset = frame.integral_offset
     keep, min_cameras = frame.keep, frame.min_cameras
     all_cameras, room = len(matrices), len(cells)
     corners, rectangle = np.zeros((9, 1)), np.zeros((4, 1), np.int32)
@@ -282,7 +285,7 @@ def _certify_triangle(
     while n_waiting > 0:
         for k in range(9):
             cell[k] = corners[k, 0] = cells[first, k]
-        n_left, accepted, is_free = ZERO, n_accept[first], False
+        n_left, n_withheld, accepted, is_free = ZERO, ZERO, n_accept[first], False
         for camera in range(all_cameras):
             if not is_open[first, camera]:
                 continue
@@ -300,25 +303,39 @@ def _certify_triangle(
                 integral_offset[camera],
                 integrals,
                 keep,
+                camera,
+                frame.recorded,
             )
             if vote == REJECTS:
                 is_free = True
                 break
             if vote == ACCEPTS:
                 accepted += 1
-            elif vote == UNDECIDED:
+            elif vote != ABSTAINS:
                 left[n_left] = camera
                 n_left += 1
+                n_withheld += vote == WITHHOLDS
         cuts = cell_cuts[first]
         first = (first + 1) % room
         n_waiting -= 1
-        if is_free or (keep and accepted + n_left < min_cameras):
+        if is_free or (keep and accepted + n_left - n_withheld < min_cameras):
             continue
         x = (cell[0] + cell[3] + cell[6]) / 3.0
         y = (cell[1] + cell[4] + cell[7]) / 3.0
         z = (cell[2] + cell[5] + cell[8]) / 3.0
         if _is_inside(
-            x, y, z, left, n_left, accepted, matrices, sizes, masks, mask_offset, keep, min_cameras
+            x,
+            y,
+            z,
+            left,
+            n_left,
+            accepted,
+            matrices,
+            sizes,
+            answers,
+            mask_offset,
+            keep,
+            min_cameras,
         ):
             witness[0], witness[1], witness[2] = x, y, z
             return COLLIDING, 0.0

@@ -105,15 +105,15 @@ def make_frame(hull: Hull) -> Frame:
     The camera that sees the smallest silhouette rejects most: it is asked first.
     """
     views = hull.views
-    ends = hull.integral_offset + (views.sizes_px + 1).prod(axis=1) - 1
-    order = np.argsort(hull.integrals_flat[ends] / views.sizes_px.prod(axis=1), kind="stable")
+    order = np.argsort(hull.object_shares(), kind="stable")
     return Frame(
         views.img_from_local.reshape(-1, 12)[order],
         views.sizes_px[order],
-        _read_only(hull.masks_flat),
+        _read_only(hull.answers_flat),
         hull.mask_offset[order],
         _read_only(hull.integrals_flat),
         hull.integral_offset[order],
+        None if views.seen is None else hull.recorded_offset[order],
         order,
         views.unseen == "keep",
         views.min_cameras,

@@ -10,7 +10,8 @@ buffer of hits, and only the hits are read back. A hit is four numbers:
     triangle, first sample, how many samples, mesh       a run of samples of one triangle
     triangle, WHOLE, how many triangles, mesh            all samples of a run of triangles
 
-What does not change from frame to frame (meshes, cameras) stays on the device. Of a mesh that
+What does not change from frame to frame (meshes, cameras, what these recorded of their images)
+stays on the device. Of a mesh that
 moves, only the vertices are sent again, into the buffers of the vertices they replace;
 ``volume_round.comp.glsl`` and ``volume_bounds.comp.glsl`` then compute there what the passes need
 of them.
@@ -21,6 +22,7 @@ releases it in the thread that owns the context (an object released twice breaks
 """
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,8 +88,10 @@ class _Cameras:
     buffer: moderngl.Buffer
     pad_rows: moderngl.Buffer
     precise: moderngl.Buffer
+    recorded: moderngl.Buffer
     mask_words: NDArray[np.int64]  # where each camera's mask starts, in camera order
     n_mask_words: int
+    seen_words: NDArray[np.uint32]  # what was recorded: it follows the masks of a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +178,7 @@ class Compute(Closing):
         self._group_size = _SOFTWARE_GROUP_SIZE if is_software else _GROUP_SIZE
         self._max_groups = _SOFTWARE_MAX_GROUPS if is_software else _MAX_GROUPS
         self._reject = reject
-        self._programs: dict[int, _Programs] = {}
+        self._programs: dict[tuple[int, bool], _Programs] = {}
         self._placing: tuple[moderngl.ComputeShader, moderngl.ComputeShader] | None = None
         self._cameras: _Cameras | None = None
         self._hull: Hull | None = None
@@ -242,8 +246,11 @@ class Compute(Closing):
             return self._reserve(4)
         return self._context.buffer(np.ascontiguousarray(array))
 
-    def programs_for(self, n_cameras: int) -> _Programs:
+    def programs_for(self, n_cameras: int, *, has_gaps: bool = False) -> _Programs:
         """Return the passes, compiled with room for `n_cameras` in shared memory.
+
+        With `has_gaps` for cameras that did not record all of their images: a software renderer
+        would take the look-ups that this needs for all others, too.
 
         A query does so by itself; asked beforehand, it tells whether the driver compiles them.
 
@@ -254,14 +261,15 @@ class Compute(Closing):
         """
         make_current(self._context)
         room = _room(n_cameras)
-        if room not in self._programs:
-            rectangle = f"#define N_CAMERAS {room}\n" + load_shader("rectangle.glsl")
-            self._programs[room] = _Programs(
+        if (room, has_gaps) not in self._programs:
+            constants = f"#define N_CAMERAS {room}\n#define GAPS {int(has_gaps)}\n"
+            rectangle = constants + load_shader("rectangle.glsl")
+            self._programs[room, has_gaps] = _Programs(
                 self._compile("volume_cluster.comp.glsl", rectangle),
                 self._compile("volume_reject.comp.glsl", rectangle),
                 self._compile("volume_sample.comp.glsl", rectangle),
             )
-        return self._programs[room]
+        return self._programs[room, has_gaps]
 
     def _compile(self, name: str, *parts: str) -> moderngl.ComputeShader:
         constants = (
@@ -280,19 +288,15 @@ class Compute(Closing):
         """
         views = hull.views
         # The camera that sees the smallest silhouette rejects most: ask it first.
-        ends = hull.integral_offset + (views.sizes_px + 1).prod(axis=1) - 1
-        order = np.argsort(hull.integrals_flat[ends] / views.sizes_px.prod(axis=1), kind="stable")
+        order = np.argsort(hull.object_shares(), kind="stable")
         cameras = self._cameras
         if cameras is None or cameras.views is not views:
             cameras = self._upload_cameras(hull)
         turns = np.zeros(_room(len(views)), np.uint32)
         turns[: len(views)] = order
-        words = np.zeros(cameras.n_mask_words, "<u4")
-        packed = words.view(np.uint8)
-        for camera in range(len(views)):
-            bits = np.packbits(hull.mask(camera).reshape(-1), bitorder="little")
-            first = 4 * int(cameras.mask_words[camera])
-            packed[first : first + len(bits)] = bits
+        images = [hull.mask(camera) for camera in range(len(views))]
+        words = _packed(images, cameras.mask_words, cameras.n_mask_words)
+        words = np.concatenate([words, cameras.seen_words])
         self._masks = self._rewrite(self._masks, words, "the masks of a frame")
         self._integrals = self._rewrite(
             self._integrals, hull.integrals_flat, "the integral images of a frame"
@@ -310,6 +314,16 @@ class Compute(Closing):
         used["width"], used["height"] = views.sizes_px.T
         used["first_mask_word"] = mask_words[:-1]
         used["first_integral"] = hull.integral_offset
+        recorded = np.zeros((_room(len(views)), 4), np.uint32)
+        seen_words = np.zeros(0, np.uint32)
+        if views.seen is not None:
+            some = np.flatnonzero(views.seen.mask_offset >= 0)
+            starts = np.concatenate([[0], np.cumsum(n_words[some])]).astype(np.int64)
+            images = [image for k in some if (image := views.seen_mask(int(k))) is not None]
+            seen_words = _packed(images, starts[:-1], int(starts[-1]))
+            recorded[some, 0] = mask_words[-1] + starts[:-1]
+            recorded[some, 1] = hull.recorded_offset[some]
+            recorded[some, 2] = 1
         pad_rows = np.zeros((_room(len(views)), 2, 4), np.float32)
         pad_rows[: len(views)] = _pad_rows(views)
         precise = np.concatenate([views.origin_world, views.img_from_local.reshape(-1)])
@@ -318,8 +332,10 @@ class Compute(Closing):
             self._upload(table.view(np.uint8), "the cameras"),
             self._upload(pad_rows, "the cameras"),
             self._upload(precise, "the cameras"),
+            self._upload(recorded, "the cameras"),
             mask_words[:-1],
             int(mask_words[-1]),
+            seen_words,
         )
 
     def _rewrite(self, buffer: moderngl.Buffer, array: NDArray[Any], what: str) -> moderngl.Buffer:
@@ -427,7 +443,7 @@ class Compute(Closing):
     ) -> tuple[int, int]:
         """Run the passes of some launches; return how many items and hits they have."""
         assert self._cameras is not None
-        programs = self.programs_for(len(views))
+        programs = self.programs_for(len(views), has_gaps=views.seen is not None)
         counters = np.append(np.tile(_LAUNCH_COUNTERS, len(launches)), np.uint32(0))
         self._counters = self._rewrite(self._counters, counters, "the counters")
         most_clusters = max((x.stop - x.start for x in launches), default=0) // _CLUSTER + 2
@@ -435,6 +451,7 @@ class Compute(Closing):
         self._cameras.buffer.bind_to_uniform_block(0)
         self._cameras.pad_rows.bind_to_uniform_block(1)
         self._order.bind_to_uniform_block(2)
+        self._cameras.recorded.bind_to_uniform_block(3)
         self._integrals.bind_to_storage_buffer(0)
         self._open_clusters.bind_to_storage_buffer(2)
         self._items.bind_to_storage_buffer(6)
@@ -487,6 +504,18 @@ class Compute(Closing):
             self._context.memory_barrier(barrier | self._context.BUFFER_UPDATE_BARRIER_BIT)
         counters = np.frombuffer(self._counters.read(), np.uint32)
         return int(counters[7:-1:8].max(initial=0)), int(counters[-1])
+
+
+def _packed(
+    images: Sequence[NDArray[np.uint8]], first_word: NDArray[np.int64], n_words: int
+) -> NDArray[np.uint32]:
+    """Return images of 0 and 1 as one bit a pixel, each from a word of its own on."""
+    words = np.zeros(n_words, "<u4")
+    packed = words.view(np.uint8)
+    for image, word in zip(images, first_word.tolist(), strict=True):
+        bits = np.packbits(image.reshape(-1), bitorder="little")
+        packed[4 * word : 4 * word + len(bits)] = bits
+    return words
 
 
 def _pad_rows(views: Views) -> NDArray[np.float64]:

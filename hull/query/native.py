@@ -20,9 +20,11 @@ from hybridve.hull.jit import ZERO, compiled, inlined
 from hybridve.hull.query.clusters import make_frame, make_shares
 from hybridve.hull.query.engine import Closing, Hits, Triangles
 from hybridve.hull.query.rectangles import (
+    ABSTAINS,
     ACCEPTS,
     REJECTS,
     UNDECIDED,
+    WITHHOLDS,
     Frame,
     Surface,
     Tree,
@@ -30,7 +32,7 @@ from hybridve.hull.query.rectangles import (
     rectangle_vote,
     survivors,
 )
-from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, Hull
 from hybridve.hull.query.threads import Threads
 from hybridve.hull.query.viewport import n_samples, sample_steps
 
@@ -127,6 +129,8 @@ def _tile_vote(
     first: int,
     integrals: NDArray[np.int32],
     keep: bool,
+    camera: int,
+    recorded: NDArray[np.int64] | None,
 ) -> int:
     """Return what one camera proves of samples i0 <= i < i0 + size, likewise j, i + j <= last."""
     reach = size - 1
@@ -174,6 +178,8 @@ def _tile_vote(
         first,
         integrals,
         keep,
+        camera,
+        recorded,
     )
 
 
@@ -187,7 +193,7 @@ def _sample_tile(
     n_accept: int,
     steps: NDArray[np.float64],
     sizes: NDArray[np.int64],
-    masks: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     mask_offset: NDArray[np.int64],
     keep: bool,
     min_cameras: int,
@@ -225,9 +231,10 @@ def _sample_tile(
                 )
                 seen = depth_m > 0 and 0 <= pixel_x < right and 0 <= pixel_y < bottom
                 if seen:
+                    answer = answers[first + int(pixel_y) * width + int(pixel_x)]
                     if keep:
-                        n_seen[8 * dj + di] += 1
-                    if not masks[first + int(pixel_y) * width + int(pixel_x)]:
+                        n_seen[8 * dj + di] += answer == OBJECT
+                    if answer == BACKGROUND:
                         word &= ~(one << bit)
                 elif not keep:
                     word &= ~(one << bit)
@@ -270,7 +277,7 @@ def _sample_block(
         size = _BLOCK >> level
         rest = last - i0 - j0
         edge = min(rest, size - 1) + 1
-        accepted, n_left = room.n_accept[level], ZERO
+        accepted, n_left, n_withheld = room.n_accept[level], ZERO, ZERO
         is_free = False
         # The block that holds the whole triangle was asked with it.
         is_known = level == top and viewport <= size
@@ -291,16 +298,19 @@ def _sample_block(
                     frame.integral_offset[camera],
                     integrals,
                     keep,
+                    camera,
+                    frame.recorded,
                 )
             if vote == REJECTS:
                 is_free = True
                 break
             if vote == ACCEPTS:
                 accepted += 1
-            elif vote == UNDECIDED:
+            elif vote != ABSTAINS:
                 cameras[level + 1, n_left] = camera
                 n_left += 1
-        if is_free or (frame.keep and accepted + n_left < frame.min_cameras):
+                n_withheld += vote == WITHHOLDS
+        if is_free or (keep and accepted + n_left - n_withheld < frame.min_cameras):
             continue
         if n_left == 0:
             for tile_j in range(j0 // 8, (j0 + size) // 8):
@@ -320,7 +330,7 @@ def _sample_block(
                 accepted,
                 steps,
                 sizes,
-                frame.masks,
+                frame.answers,
                 frame.mask_offset,
                 keep,
                 frame.min_cameras,
@@ -362,7 +372,7 @@ def _sample_all(
     n_accept: int,
     steps: NDArray[np.float64],
     sizes: NDArray[np.int64],
-    masks: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     mask_offset: NDArray[np.int64],
     keep: bool,
     min_cameras: int,
@@ -400,7 +410,8 @@ def _sample_all(
         for sample in range(n_samples):
             pixel = pixels[sample]
             if pixel >= 0:
-                n_seen[sample] += 1 if masks[pixel] else _NEVER
+                answer = answers[pixel]
+                n_seen[sample] += _NEVER if answer == BACKGROUND else answer == OBJECT
             elif not keep:
                 n_seen[sample] += _NEVER
     needed = min_cameras if keep else n_accept + n_cameras
@@ -439,7 +450,7 @@ def _query(
     runs, n_runs = np.zeros((256, 2), np.int64), ZERO
     left = survivors(nodes, level, tree, surface, frame)
     vertices, faces, matrices = surface.vertices_local, surface.faces, frame.matrices
-    sizes, masks, mask_offset = frame.sizes, frame.masks, frame.mask_offset
+    sizes, answers, mask_offset = frame.sizes, frame.answers, frame.mask_offset
     steps = room.steps
     pixels, n_seen = np.zeros((2, len(_SMALL_GRIDS[0, 0])), np.int64)
     for k in range(len(left.start)):
@@ -470,7 +481,7 @@ def _query(
                 left.n_accept[k],
                 steps,
                 sizes,
-                masks,
+                answers,
                 mask_offset,
                 frame.keep,
                 frame.min_cameras,

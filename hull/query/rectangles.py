@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
 
-#: What one camera's rectangle proves: no sample inside, all on object pixels, none seen, nothing.
-REJECTS, ACCEPTS, ABSTAINS, UNDECIDED = 0, 1, 2, 3
+#: What one camera's rectangle proves: no sample inside, all on object pixels, none seen, nothing,
+#: none seen on an object pixel (of a camera that may abstain; it may still reject some).
+REJECTS, ACCEPTS, ABSTAINS, UNDECIDED, WITHHOLDS = 0, 1, 2, 3, 4
 
 #: Triangles whose rectangles are computed together: their corners stay in the first cache.
 BATCH = 256
@@ -36,8 +37,11 @@ class Frame(NamedTuple):
         Projections in pixels from metres, local frame, row-major.
     sizes : (C, 2) int64
         Width and height.
-    masks, mask_offset, integrals, integral_offset
+    answers, mask_offset, integrals, integral_offset
         As in `hybridve.hull.query.silhouettes.Hull`.
+    recorded : (C,) int64 or None
+        `hybridve.hull.query.silhouettes.Hull.recorded_offset`; None where all cameras recorded all
+        of their images. That is another type, so that the loops for them are compiled without.
     order : (C,) int64
         The number of each camera in the views.
     keep : bool
@@ -48,10 +52,11 @@ class Frame(NamedTuple):
 
     matrices: NDArray[np.float64]
     sizes: NDArray[np.int64]
-    masks: NDArray[np.uint8]
+    answers: NDArray[np.uint8]
     mask_offset: NDArray[np.int64]
     integrals: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
+    recorded: NDArray[np.int64] | None
     order: NDArray[np.int64]
     keep: bool
     min_cameras: int
@@ -102,10 +107,13 @@ def rectangle_vote(
     first: int,
     integrals: NDArray[np.int32],
     keep: bool,
+    camera: int,
+    recorded: NDArray[np.int64] | None,
 ) -> int:
     """Return what a rectangle of pixels, clamped to -1..size, proves in one camera.
 
-    Its image is width x height pixels, its integral image begins at `first`.
+    Its image is width x height pixels, its integral image begins at `first`, and that of what it
+    recorded where `recorded` says of it.
     """
     x0, x1 = max(first_x, 0), min(last_x + 1, width)
     y0, y1 = max(first_y, 0), min(last_y + 1, height)
@@ -119,8 +127,21 @@ def rectangle_vote(
         - integrals[below + x0]
         + integrals[above + x0]
     )
-    if count == 0 and (wholly_seen or not keep):
-        return REJECTS
+    if recorded is not None:  # not compiled where it is
+        start = recorded[camera]
+        if start >= 0:
+            above, below = start + y0 * (width + 1), start + y1 * (width + 1)
+            n_seen = (
+                integrals[below + x1]
+                - integrals[above + x1]
+                - integrals[below + x0]
+                + integrals[above + x0]
+            )
+            if n_seen == 0:
+                return ABSTAINS
+            wholly_seen = wholly_seen and n_seen == (x1 - x0) * (y1 - y0)
+    if count == 0:
+        return REJECTS if wholly_seen or not keep else WITHHOLDS
     if wholly_seen and count == (x1 - x0) * (y1 - y0):
         return ACCEPTS
     return UNDECIDED
@@ -260,6 +281,7 @@ def _node_verdict(
     sizes: NDArray[np.int64],
     integrals: NDArray[np.int32],
     integral_offset: NDArray[np.int64],
+    recorded: NDArray[np.int64] | None,
     keep: bool,
     min_cameras: int,
     cameras: NDArray[np.int64],
@@ -278,7 +300,7 @@ def _node_verdict(
     is_free : bool
         Whether no sample of the node can be inside.
     """
-    n_left = ZERO
+    n_left, n_withheld = ZERO, ZERO
     for number in range(n_cameras):
         camera = cameras[number]
         place = order[camera]
@@ -292,15 +314,18 @@ def _node_verdict(
             integral_offset[camera],
             integrals,
             keep,
+            camera,
+            recorded,
         )
         if vote == REJECTS:
             return n_left, n_accept, True
         if vote == ACCEPTS:
             n_accept += 1
-        elif vote == UNDECIDED:
+        elif vote != ABSTAINS:
             left[n_left] = camera
             n_left += 1
-    return n_left, n_accept, keep and n_accept + n_left < min_cameras
+            n_withheld += vote == WITHHOLDS
+    return n_left, n_accept, keep and n_accept + n_left - n_withheld < min_cameras
 
 
 @compiled
@@ -323,6 +348,7 @@ def open_nodes(level: int, tree: Tree, frame: Frame) -> NDArray[np.int64]:
                 frame.sizes,
                 frame.integrals,
                 frame.integral_offset,
+                frame.recorded,
                 frame.keep,
                 frame.min_cameras,
                 cameras,
@@ -362,6 +388,7 @@ def _batch_verdicts(
     rectangles: NDArray[np.int32],
     triangle: NDArray[np.int64],
     accepted: NDArray[np.int64],
+    supported: NDArray[np.int64],
     is_open: NDArray[np.bool_],
 ) -> int:
     """Ask some cameras, one after the other, about consecutive triangles; return how many are left.
@@ -376,6 +403,8 @@ def _batch_verdicts(
         Written: the triangles that are not proved free, ascending.
     accepted : (n,) int64
         Written: how many cameras see nothing but object pixels of each.
+    supported : (n,) int64
+        Written, where cameras may abstain: how many may see an object pixel of each.
     is_open : (n, C) bool
         Written: which cameras are undecided about it.
     """
@@ -383,7 +412,7 @@ def _batch_verdicts(
     integrals, keep = frame.integrals, frame.keep
     all_cameras = len(frame.matrices)
     for i in range(n_triangles):
-        triangle[i], accepted[i] = start + i, n_accept
+        triangle[i], accepted[i], supported[i] = start + i, n_accept, n_accept
     n_left = n_triangles
     for number in range(n_cameras):
         camera = cameras[number]
@@ -405,19 +434,20 @@ def _batch_verdicts(
                 first,
                 integrals,
                 keep,
+                camera,
+                frame.recorded,
             )
             if vote == REJECTS:
                 continue
             n_accepted = accepted[i] + (vote == ACCEPTS)
+            if keep:
+                n_supported = supported[i] + (vote in (ACCEPTS, UNDECIDED))
+                if n_supported + n_later < frame.min_cameras:
+                    continue
+                supported[n_kept] = n_supported
             for other in range(all_cameras):
                 is_open[n_kept, other] = number > 0 and is_open[i, other]
-            is_open[n_kept, camera] = vote == UNDECIDED
-            if keep:
-                n_open = 0
-                for other in range(all_cameras):
-                    n_open += is_open[n_kept, other]
-                if n_accepted + n_open + n_later < frame.min_cameras:
-                    continue
+            is_open[n_kept, camera] = vote in (UNDECIDED, WITHHOLDS)
             triangle[n_kept], accepted[n_kept] = triangle[i], n_accepted
             for k in range(9):
                 corners[k, n_kept] = corners[k, i]
@@ -448,6 +478,7 @@ def survivors(
     stack = np.zeros(((level + 1) * BRANCH + 1, 2), np.int64)  # node within its level, level
     corners, parts = np.zeros((9, BATCH)), np.zeros((4, BATCH), np.int32)
     triangle, accepted = np.zeros(BATCH, np.int64), np.zeros(BATCH, np.int64)
+    supported = np.zeros(BATCH, np.int64)
     is_open = np.zeros((BATCH, n_cameras), np.bool_)
 
     capacity = 4 * BATCH
@@ -472,6 +503,7 @@ def survivors(
                     sizes,
                     integrals,
                     integral_offset,
+                    frame.recorded,
                     frame.keep,
                     frame.min_cameras,
                     cameras[height + 1],
@@ -504,6 +536,7 @@ def survivors(
                     parts,
                     triangle,
                     accepted,
+                    supported,
                     is_open,
                 )
                 for kept in range(n_kept):

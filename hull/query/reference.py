@@ -19,9 +19,10 @@ def contains_points(hull: Hull, points_world: NDArray[np.float64]) -> NDArray[np
     """Tell which points are inside the hull.
 
     A camera sees a point that lies in front of it (positive depth) and whose projection falls
-    into its image (0 <= x < width, 0 <= y < height). With ``unseen = "carve"`` a point is inside
-    when every camera sees it on an object pixel. With ``unseen = "keep"`` it is inside when no
-    camera sees it on a background pixel and at least ``min_cameras`` see it.
+    into its image (0 <= x < width, 0 <= y < height), with ``unseen = "keep"`` onto a pixel that
+    was recorded (`hybridve.hull.query.silhouettes.Seen`). With ``unseen = "carve"`` a point is
+    inside when every camera sees it on an object pixel. With ``unseen = "keep"`` it is inside when
+    no camera sees it on a background pixel and at least ``min_cameras`` see it.
 
     Parameters
     ----------
@@ -67,6 +68,9 @@ def _look(
         pixels = projected[:, :2] / np.where(in_front, projected[:, 2], 1.0)[:, None]
     seen = in_front & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
     column, row = np.floor(np.where(seen[:, None], pixels, 0.0)).astype(np.int64).T
+    recorded = hull.views.seen_mask(camera)
+    if recorded is not None:
+        seen &= recorded[row, column] != 0
     on_object = seen & (hull.mask(camera)[row, column] != 0)
     return seen, on_object
 

@@ -2,15 +2,18 @@
 
 A point is inside the hull when it projects onto an object pixel of every camera (Eq. 1 of Lok,
 Naik, Whitton and Brooks, 2003). Two rules for a camera that cannot see a point, because it lies
-behind the camera or outside its image:
+behind the camera, outside its image, or on a pixel of the image that nothing was recorded for:
 
 * ``unseen = "carve"``: the point is outside the hull.
 * ``unseen = "keep"``: the camera abstains, and at least ``min_cameras`` must see the point.
 
 The silhouettes are those of pinhole images: lens distortion was removed from them. Their pixel is
-the floor of the projection; the centre of the top-left pixel is (0.5, 0.5).
+the floor of the projection; the centre of the top-left pixel is (0.5, 0.5). A pinhole image that
+holds all that a bent lens recorded also has pixels that it did not record (`Seen`). They are
+background to a camera that carves, and nothing to one that abstains.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,8 +23,98 @@ from numpy.typing import NDArray
 
 Unseen = Literal["carve", "keep"]
 
+#: What a camera says at a pixel of its image. Whatever is not 0 does not deny the point.
+BACKGROUND, OBJECT, UNSEEN = 0, 1, 2
+
 #: Two projections are those of one camera if a rotation leads from one to the other, to this error.
 _ROTATION_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Which pixels of the pinhole images were recorded; the same for all frames.
+
+    Build it with `make_seen`. Flat buffers as those of `Hull`, of the cameras that have pixels
+    that were not recorded; the others have no place in them.
+
+    Attributes
+    ----------
+    masks_flat : (sum of H*W,) uint8
+        1 on pixels that were recorded, else 0.
+    mask_offset : (C,) int64
+        Where each camera's mask starts in `masks_flat`; -1 for one that recorded all its image.
+    integrals_flat : (sum of (H+1)*(W+1),) int32
+        Per camera the number of recorded pixels above and left of each pixel corner.
+    integral_offset : (C,) int64
+        Where each camera's integral image starts in `integrals_flat`; -1 likewise.
+    """
+
+    masks_flat: NDArray[np.uint8]
+    mask_offset: NDArray[np.int64]
+    integrals_flat: NDArray[np.int32]
+    integral_offset: NDArray[np.int64]
+
+    def of(self, cameras: NDArray[np.int64]) -> "Seen":
+        """Return what some of the cameras, by number, recorded; images are shared, not copied."""
+        return replace(
+            self,
+            mask_offset=self.mask_offset[cameras],
+            integral_offset=self.integral_offset[cameras],
+        )
+
+    def is_same(self, other: "Seen") -> bool:
+        """Tell whether two say the same of all pixels, given cameras of the same image sizes."""
+        return self is other or (
+            np.array_equal(self.mask_offset, other.mask_offset)
+            and np.array_equal(self.masks_flat, other.masks_flat)
+        )
+
+
+def make_seen(
+    names: tuple[str, ...],
+    sizes_px: NDArray[np.int64],
+    masks: Sequence[NDArray[np.bool_] | NDArray[np.uint8] | None],
+) -> Seen | None:
+    """Return which pixels of the cameras' pinhole images were recorded; None for all of them.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The cameras, C of them.
+    sizes_px : (C, 2) int64
+        Width and height of each image.
+    masks : sequence of C (H, W) bool or uint8, or None
+        Not 0 where a pixel was recorded; None for a camera that recorded all of its image.
+
+    Raises
+    ------
+    ValueError
+        If there are not C masks of the cameras' sizes.
+    """
+    if len(masks) != len(names):
+        raise ValueError(f"{len(masks)} masks of what was seen for {len(names)} cameras")
+    mask_offset = np.full(len(masks), -1, np.int64)
+    integral_offset = np.full(len(masks), -1, np.int64)
+    flat, integrals = [np.zeros(0, np.uint8)], [np.zeros(0, np.int32)]
+    for camera, mask in enumerate(masks):
+        if mask is None:
+            continue
+        width, height = (int(size) for size in sizes_px[camera])
+        if mask.shape != (height, width):
+            raise ValueError(
+                f"what camera {names[camera]} saw has shape {mask.shape}, "
+                f"expected {(height, width)}"
+            )
+        if (mask != 0).all():
+            continue
+        seen = np.asarray(mask != 0).view(np.uint8)
+        mask_offset[camera] = sum(map(len, flat))
+        integral_offset[camera] = sum(map(len, integrals))
+        flat.append(seen.ravel())
+        integrals.append(np.asarray(cv2.integral(seen, sdepth=cv2.CV_32S), np.int32).ravel())
+    if (mask_offset < 0).all():
+        return None
+    return Seen(np.concatenate(flat), mask_offset, np.concatenate(integrals), integral_offset)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +135,9 @@ class Views:
         Origin of the local frame: ``local = world - origin_world``.
     unseen, min_cameras
         What a camera that cannot see a point says of it, and how many must see it.
+    seen : Seen or None
+        Which pixels of the images were recorded; None for all. None where unseen is "carve": there
+        a pixel that was not recorded is background like any other.
     """
 
     names: tuple[str, ...]
@@ -50,9 +146,31 @@ class Views:
     origin_world: NDArray[np.float64]
     unseen: Unseen = "carve"
     min_cameras: int = 1
+    seen: Seen | None = None
+
+    def __post_init__(self) -> None:
+        if self.seen is not None and self.unseen == "carve":
+            raise ValueError("cameras that carve see all of their images, expected seen = None")
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def seen_mask(self, camera: int) -> NDArray[np.uint8] | None:
+        """Return the (H, W) mask of what a camera recorded, 1 there; None for all its image."""
+        if self.seen is None or self.seen.mask_offset[camera] < 0:
+            return None
+        width, height = (int(size) for size in self.sizes_px[camera])
+        start = int(self.seen.mask_offset[camera])
+        return self.seen.masks_flat[start : start + width * height].reshape(height, width)
+
+    def seen_integral(self, camera: int) -> NDArray[np.int32] | None:
+        """Return the (H + 1, W + 1) integral image of `seen_mask`; None for all of the image."""
+        if self.seen is None or self.seen.integral_offset[camera] < 0:
+            return None
+        width, height = (int(size) for size in self.sizes_px[camera])
+        start = int(self.seen.integral_offset[camera])
+        stop = start + (width + 1) * (height + 1)
+        return self.seen.integrals_flat[start:stop].reshape(height + 1, width + 1)
 
 
 def make_views(
@@ -62,6 +180,7 @@ def make_views(
     unseen: Unseen = "carve",
     min_cameras: int = 1,
     origin_world: NDArray[np.float64] | None = None,
+    seen: Seen | None = None,
 ) -> Views:
     """Return views about a local origin near the working volume.
 
@@ -81,6 +200,8 @@ def make_views(
         See `Views`.
     origin_world : (3,) float64, optional
         The local origin, if it is known already.
+    seen : Seen, optional
+        Which pixels of the images were recorded, by default all; see `make_seen`.
 
     Raises
     ------
@@ -98,7 +219,9 @@ def make_views(
     origin = _origin(scaled) if origin_world is None else origin_world
     img_from_local = scaled.copy()
     img_from_local[:, :, 3] += scaled[:, :, :3] @ origin
-    return Views(names, np.asarray(sizes_px, np.int64), img_from_local, origin, unseen, min_cameras)
+    sizes_px = np.asarray(sizes_px, np.int64)
+    seen = seen if unseen == "keep" else None
+    return Views(names, sizes_px, img_from_local, origin, unseen, min_cameras, seen)
 
 
 def _origin(img_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,6 +268,7 @@ def interpolated_views(before: Views, after: Views, fraction: float) -> Views:
         or (before.unseen, before.min_cameras) != (after.unseen, after.min_cameras)
         or (before.sizes_px != after.sizes_px).any()
         or (before.origin_world != after.origin_world).any()
+        or not _is_same_seen(before.seen, after.seen)
     ):
         raise ValueError("not of the same views, nor of the same cameras moved")
     # Both are K R with one K, or they are not of one camera.
@@ -161,6 +285,12 @@ def interpolated_views(before: Views, after: Views, fraction: float) -> Views:
         matrix = first[camera, :, :3] @ turn
         matrices[camera] = np.column_stack([matrix, -matrix @ centers[camera]])
     return replace(before, img_from_local=matrices)
+
+
+def _is_same_seen(first: Seen | None, second: Seen | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return first.is_same(second)
 
 
 def _rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -192,26 +322,40 @@ class Hull:
         The cameras.
     masks_flat : (sum of H*W,) uint8
         1 on object pixels, else 0; row-major per camera.
+    answers_flat : (sum of H*W,) uint8
+        What each camera says at each pixel: `BACKGROUND`, `OBJECT` or `UNSEEN`. The same array as
+        `masks_flat` where the views have no pixel that was not recorded.
     mask_offset : (C,) int64
-        Where each camera's mask starts in `masks_flat`.
+        Where each camera's mask starts in `masks_flat` and `answers_flat`.
     integrals_flat : (sum of (H+1)*(W+1),) int32
         Per camera the number of object pixels above and left of each pixel corner
-        (``cv2.integral``), so that four look-ups count the object pixels of a rectangle.
-    integral_offset : (C,) int64
-        Where each camera's integral image starts in `integrals_flat`.
+        (``cv2.integral``), so that four look-ups count the object pixels of a rectangle. Behind
+        them, those of the views' `Seen`: compiled code takes one array sooner than two.
+    integral_offset, recorded_offset : (C,) int64
+        Where each camera's integral images start in `integrals_flat`: that of object pixels, and
+        that of recorded pixels, -1 for a camera that recorded all of its image.
     """
 
     views: Views
     masks_flat: NDArray[np.uint8]
+    answers_flat: NDArray[np.uint8]
     mask_offset: NDArray[np.int64]
     integrals_flat: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
+    recorded_offset: NDArray[np.int64]
 
     def mask(self, camera: int) -> NDArray[np.uint8]:
         """Return the (H, W) silhouette of one camera, 1 on object pixels."""
+        return self._image(self.masks_flat, camera)
+
+    def answers(self, camera: int) -> NDArray[np.uint8]:
+        """Return what one camera says at its pixels, (H, W); see `answers_flat`."""
+        return self._image(self.answers_flat, camera)
+
+    def _image(self, flat: NDArray[np.uint8], camera: int) -> NDArray[np.uint8]:
         width, height = (int(size) for size in self.views.sizes_px[camera])
         start = int(self.mask_offset[camera])
-        return self.masks_flat[start : start + width * height].reshape(height, width)
+        return flat[start : start + width * height].reshape(height, width)
 
     def integral(self, camera: int) -> NDArray[np.int32]:
         """Return the (H + 1, W + 1) integral image of one camera."""
@@ -219,6 +363,11 @@ class Hull:
         start = int(self.integral_offset[camera])
         stop = start + (width + 1) * (height + 1)
         return self.integrals_flat[start:stop].reshape(height + 1, width + 1)
+
+    def object_shares(self) -> NDArray[np.float64]:
+        """Return which share (C,) of each image are object pixels."""
+        ends = self.integral_offset + (self.views.sizes_px + 1).prod(axis=1) - 1
+        return np.asarray(self.integrals_flat[ends] / self.views.sizes_px.prod(axis=1))
 
 
 def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
@@ -229,7 +378,8 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
     views : Views
         C cameras.
     masks : list of C (H, W) uint8
-        Silhouettes without lens distortion; object pixels are those above 0.
+        Silhouettes without lens distortion; object pixels are those above 0. Of a pixel that was
+        not recorded, whatever a mask says of it is not taken.
 
     Raises
     ------
@@ -242,13 +392,24 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
     corners = (views.sizes_px + 1).prod(axis=1)
     mask_offset = np.concatenate([[0], np.cumsum(areas)[:-1]]).astype(np.int64)
     integral_offset = np.concatenate([[0], np.cumsum(corners)[:-1]]).astype(np.int64)
+    recorded_offset = np.full(len(views), -1, np.int64)
+    masks_flat = np.zeros(int(areas.sum()), np.uint8)
+    n_corners = n_integrals = int(corners.sum())
+    if views.seen is not None:
+        has_gaps = views.seen.integral_offset >= 0
+        recorded_offset[has_gaps] = n_corners + views.seen.integral_offset[has_gaps]
+        n_integrals += len(views.seen.integrals_flat)
     hull = Hull(
         views,
-        np.zeros(int(areas.sum()), np.uint8),
+        masks_flat,
+        masks_flat if views.seen is None else np.zeros_like(masks_flat),
         mask_offset,
-        np.zeros(int(corners.sum()), np.int32),
+        np.zeros(n_integrals, np.int32),
         integral_offset,
+        recorded_offset,
     )
+    if views.seen is not None:
+        hull.integrals_flat[n_corners:] = views.seen.integrals_flat
     for camera, mask in enumerate(masks):
         target = hull.mask(camera)
         if mask.shape != target.shape:
@@ -257,5 +418,12 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
                 f"expected {target.shape}"
             )
         np.greater(mask, 0, out=target.view(np.bool_))
+        if views.seen is not None:
+            seen, answers = views.seen_mask(camera), hull.answers(camera)
+            if seen is None:
+                answers[:] = target
+            else:
+                np.bitwise_and(target, seen, out=target)
+                np.add(target, np.uint8(UNSEEN) * (np.uint8(1) - seen), out=answers)
         cv2.integral(target, sum=hull.integral(camera), sdepth=cv2.CV_32S)
     return hull

@@ -20,7 +20,7 @@ Two things differ from the paper's programs:
   read back are the same, and like a stencil with ``GL_INCR`` the counter saturates at 255.
 * ``unseen = "keep"``, of which the paper does not speak: a camera that sees a sample on background
   fills the counter, which then says so for good, since it saturates; one that does not see it
-  adds nothing.
+  adds nothing, be it outside the image or on a pixel that was not recorded.
 
 Objects on the device are dropped, never released by name: moderngl queues what Python drops, and
 ``gc()`` releases it in the thread that owns the context (see `hybridve.hull.query.compute`).
@@ -258,9 +258,11 @@ class Stencil(Closing):
             self._views = views
         for camera, texture in enumerate(self._increments):
             width, height = (int(size) for size in views.sizes_px[camera])
-            mask = hull.mask(camera)
-            # 1 stays 1, and 0 becomes 255.
+            mask, seen = hull.mask(camera), views.seen_mask(camera)
+            # 1 stays 1, and 0 becomes 255, but where a camera abstains.
             added = mask if views.unseen == "carve" else mask | (mask - np.uint8(1))
+            if seen is not None:
+                added *= seen
             texture.write(added, viewport=(1, 1, width, height), alignment=1)
         self._hull = hull
 

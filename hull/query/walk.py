@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
-from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, UNSEEN, Hull
 
 #: Stretches and gaps shorter than this are not told: rounding makes them where a ray crosses a
 #: column and a row at once. Crossings within the working volume are off by some 1e-15 m.
@@ -29,9 +29,6 @@ _LOOK_M = 1e-9
 
 #: Less counts as this, lest a pixel be divided by zero.
 _LEAST_DEPTH_M = float(np.finfo(np.float64).tiny)
-
-#: What a camera says of a point: it does not see it, it sees background, it sees an object pixel.
-_UNSEEN, _BACKGROUND, _OBJECT = -1, 0, 1
 
 #: Radius of the window that a silhouette's direction is taken from. A straight rim is a staircase
 #: of pixels: on random half planes the direction is off by 1.1 degrees in the mean and 9 at most,
@@ -126,9 +123,10 @@ def spans_of_rays(
         step,
         float(reach_m),
         np.ascontiguousarray(views.sizes_px),
-        hull.masks_flat,
+        hull.answers_flat,
         hull.mask_offset,
         views.unseen == "keep",
+        views.seen is not None,
         int(views.min_cameras),
     )
     return [spans_m[i:j] for i, j in itertools.pairwise(offset.tolist())]
@@ -186,10 +184,10 @@ def boundary_cameras(
     before, behind = _is_inside(hull, states)
     if behind or not before:
         return ()
-    ends = states[:, 1] == _BACKGROUND
-    n_seen = int((states[:, 1] != _UNSEEN).sum())
+    ends = states[:, 1] == BACKGROUND
+    n_seen = int((states[:, 1] != UNSEEN).sum())
     if views.unseen == "carve" or n_seen < views.min_cameras:
-        ends |= (states[:, 1] == _UNSEEN) & (states[:, 0] == _OBJECT)
+        ends |= (states[:, 1] == UNSEEN) & (states[:, 0] == OBJECT)
     return tuple(np.flatnonzero(ends).tolist())
 
 
@@ -204,6 +202,7 @@ def silhouette_normal(
 
     Beyond the image's border nothing is seen: background to a camera that carves there, while one
     that abstains is taken to see what it sees at its border, unless only the border is a boundary.
+    Pixels that it did not record lie beyond it too.
 
     Parameters
     ----------
@@ -218,8 +217,8 @@ def silhouette_normal(
     -------
     (3,) float64
         Unit vector in the world's frame that points out of the hull. NaN where there is none: the
-        point does not lie in front of the camera and in its image, the window holds no boundary,
-        or what it holds has no side (the middle of a line).
+        point does not lie in front of the camera and in its image, on a pixel that was recorded,
+        the window holds no boundary, or what it holds has no side (the middle of a line).
     """
     nowhere = np.full(3, np.nan)
     views = hull.views
@@ -233,9 +232,14 @@ def silhouette_normal(
     border_px = 1e-6  # an end at the border may be rounded to either side of it
     if not ((pixel >= -border_px) & (pixel <= np.add([width, height], border_px))).all():
         return nowhere
+    answers = hull.answers(camera)
+    corners = pixel + border_px * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    columns, rows = np.clip(corners.astype(np.int64), 0, (width - 1, height - 1)).T
+    if (answers[rows, columns] == UNSEEN).all():
+        return nowhere
     guesses: tuple[int | None, ...] = (None, 0, 1) if views.unseen == "keep" else (0,)
     for beyond in guesses:
-        moment = _moment(hull.mask(camera), pixel, beyond)
+        moment = _moment(answers, pixel, beyond)
         if np.linalg.norm(moment) > _NO_MOMENT:
             break
     else:
@@ -354,13 +358,14 @@ def _walk_camera(
     step: NDArray[np.float64],
     first_m: float,
     last_m: float,
-    mask: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     width: int,
+    unwanted: int,
     spans_m: NDArray[np.float64],
     n_spans: int,
 ) -> int:
-    """Write where, in a stretch that a camera sees, it sees object pixels."""
-    height = len(mask) // width
+    """Write where, in a stretch that projects into a camera's image, its answer is not unwanted."""
+    height = len(answers) // width
     x0, y0, z0 = begin
     x1, y1, z1 = step
     columns = _lines_crossed(x0, z0, x1, z1, width, first_m, last_m)
@@ -376,7 +381,7 @@ def _walk_camera(
         # Whatever rounding, or an overflow, made of them: a pixel of the image.
         column = int(min(x, width - 1.0)) if x > 0 else 0
         row = int(min(y, height - 1.0)) if y > 0 else 0
-        if mask[row * width + column]:
+        if answers[row * width + column] != unwanted:
             n_spans = _append(at_m, until_m, spans_m, n_spans)
         at_m = until_m
         if column_m <= at_m:
@@ -392,20 +397,30 @@ def _walk_camera(
 def _seen_enough(
     seen_m: NDArray[np.float64], min_cameras: int, reach_m: float, spans_m: NDArray[np.float64]
 ) -> int:
-    """Write where at least so many cameras see a ray, and return how many stretches that are."""
-    edges_m = np.zeros(2 * len(seen_m) + 2)
-    edges_m[1] = reach_m
-    for camera in range(len(seen_m)):
-        edges_m[2 * camera + 2] = min(seen_m[camera, 0], reach_m)
-        edges_m[2 * camera + 3] = min(seen_m[camera, 1], reach_m)
-    edges_m.sort()
-    n_spans = ZERO
-    for i in range(len(edges_m) - 1):
-        n_seen = ZERO
-        for camera in range(len(seen_m)):
-            n_seen += seen_m[camera, 0] <= edges_m[i] and edges_m[i + 1] <= seen_m[camera, 1]
-        if edges_m[i] < edges_m[i + 1] and n_seen >= min_cameras:
-            n_spans = _append(edges_m[i], edges_m[i + 1], spans_m, n_spans)
+    """Write where at least so many cameras see a ray, and return how many stretches that are.
+
+    Of each camera there are the stretches (N, 2) in which it sees the ray, all cameras together.
+    """
+    begins_m, ends_m = np.zeros(len(seen_m)), np.zeros(len(seen_m))
+    for i in range(len(seen_m)):
+        begins_m[i], ends_m[i] = min(seen_m[i, 0], reach_m), min(seen_m[i, 1], reach_m)
+    begins_m.sort()
+    ends_m.sort()
+    n_spans, n_begun, n_ended = ZERO, ZERO, ZERO
+    at_m = 0.0
+    while at_m < reach_m:
+        while n_begun < len(begins_m) and begins_m[n_begun] <= at_m:
+            n_begun += 1
+        while n_ended < len(ends_m) and ends_m[n_ended] <= at_m:
+            n_ended += 1
+        until_m = reach_m
+        if n_begun < len(begins_m):
+            until_m = min(until_m, begins_m[n_begun])
+        if n_ended < len(ends_m):
+            until_m = min(until_m, ends_m[n_ended])
+        if n_begun - n_ended >= min_cameras:
+            n_spans = _append(at_m, until_m, spans_m, n_spans)
+        at_m = until_m
     return n_spans
 
 
@@ -415,21 +430,24 @@ def _walk(
     step: NDArray[np.float64],
     reach_m: float,
     sizes: NDArray[np.int64],
-    masks: NDArray[np.uint8],
+    answers: NDArray[np.uint8],
     mask_offset: NDArray[np.int64],
     keep: bool,
+    has_gaps: bool,
     min_cameras: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the stretches (N, 2) of all rays, and where each ray's begin among them (R + 1,).
 
     The homogeneous projection of a ray's point at t is ``begin + t * step``, (R, C, 3). Camera
     after camera takes away what it sees background in: what one has taken the next need not walk.
+    With `has_gaps` some camera has pixels that it did not record.
     """
     n_rays, n_cameras = begin.shape[:2]
     # Each line of pixels is crossed once, and the border of an image twice.
     most = 2 * n_cameras + 2 + sizes.sum() + 4 * n_cameras
     left_m, then_m = np.zeros((most, 2)), np.zeros((most, 2))
     seen_m = np.zeros((n_cameras, 2))
+    recorded_m = np.zeros((most if has_gaps else 0, 2))
     told_m = np.zeros((8, 2))
     offset = np.zeros(n_rays + 1, np.int64)
     n_told = ZERO
@@ -446,7 +464,25 @@ def _walk(
             first_m = max(first_m, seen_m[camera, 0])
             last_m = min(last_m, seen_m[camera, 1])
         n_left = ZERO
-        if keep:
+        if has_gaps:
+            n_recorded = ZERO
+            for camera in range(n_cameras):
+                if seen_m[camera, 0] < seen_m[camera, 1]:
+                    first, width, height = mask_offset[camera], sizes[camera, 0], sizes[camera, 1]
+                    # Of its own array: the first stretch of a camera does not prolong another's.
+                    n_recorded += _walk_camera(
+                        begin[ray, camera],
+                        step[ray, camera],
+                        seen_m[camera, 0],
+                        seen_m[camera, 1],
+                        answers[first : first + width * height],
+                        width,
+                        UNSEEN,
+                        recorded_m[n_recorded:],
+                        ZERO,
+                    )
+            n_left = _seen_enough(recorded_m[:n_recorded], min_cameras, reach_m, left_m)
+        elif keep:
             n_left = _seen_enough(seen_m, min_cameras, reach_m, left_m)
         elif first_m < last_m:
             n_left = _append(first_m, last_m, left_m, n_left)
@@ -454,7 +490,8 @@ def _walk(
             n_then = ZERO
             first_m, last_m = seen_m[camera]
             width, height = sizes[camera]
-            mask = masks[mask_offset[camera] : mask_offset[camera] + width * height]
+            first = mask_offset[camera]
+            image = answers[first : first + width * height]
             for i in range(n_left):
                 from_m, to_m = left_m[i]
                 if from_m < first_m:  # it abstains
@@ -465,8 +502,9 @@ def _walk(
                         step[ray, camera],
                         max(from_m, first_m),
                         min(to_m, last_m),
-                        mask,
+                        image,
                         width,
+                        BACKGROUND,
                         then_m,
                         n_then,
                     )
@@ -493,18 +531,18 @@ def _walk(
 
 
 def _at_pixels(hull: Hull, projected: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return the silhouettes (C, N) at projections (C, 3, N) that are seen but for rounding."""
+    """Return the answers (C, N) at projections (C, 3, N) into the images but for rounding."""
     sizes_px = hull.views.sizes_px
     depth_m = np.maximum(projected[:, 2:], np.finfo(np.float64).tiny)
     with np.errstate(over="ignore"):
         pixels = np.clip(projected[:, :2] / depth_m, 0, sizes_px[:, :, None] - 1)
     pixels = pixels.astype(np.int64)  # not negative: the floor
     at = hull.mask_offset[:, None] + pixels[:, 1] * sizes_px[:, :1] + pixels[:, 0]
-    silhouettes: NDArray[np.uint8] = hull.masks_flat[at]
-    return silhouettes
+    answers: NDArray[np.uint8] = hull.answers_flat[at]
+    return answers
 
 
-def _states(hull: Hull, points_local: NDArray[np.float64]) -> NDArray[np.int8]:
+def _states(hull: Hull, points_local: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return what each camera says of each point: (N, 3) to (C, N)."""
     views = hull.views
     projected = views.img_from_local[:, :, :3] @ points_local.T + views.img_from_local[:, :, 3:]
@@ -512,37 +550,54 @@ def _states(hull: Hull, points_local: NDArray[np.float64]) -> NDArray[np.int8]:
     # Over the depth, lest a point just in front of the camera overflow.
     in_image = (projected[:, :2] >= 0) & (projected[:, :2] < views.sizes_px[:, :, None] * depth_m)
     seen = (depth_m[:, 0] > 0) & in_image.all(axis=1)
-    return np.where(seen, _at_pixels(hull, projected).astype(np.int8), np.int8(_UNSEEN))
+    return np.where(seen, _at_pixels(hull, projected), np.uint8(UNSEEN))
 
 
-def _is_inside(hull: Hull, states: NDArray[np.int8]) -> NDArray[np.bool_]:
+def _is_inside(hull: Hull, states: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return whether points are in the hull, (C, N) to (N,)."""
     views = hull.views
     if views.unseen == "carve":
-        return np.asarray((states == _OBJECT).all(axis=0))
-    enough = (states != _UNSEEN).sum(axis=0) >= views.min_cameras
-    return np.asarray(enough & (states != _BACKGROUND).all(axis=0))
+        return np.asarray((states == OBJECT).all(axis=0))
+    enough = (states != UNSEEN).sum(axis=0) >= views.min_cameras
+    return np.asarray(enough & (states != BACKGROUND).all(axis=0))
 
 
 def _moment(
-    mask: NDArray[np.uint8], pixel: NDArray[np.float64], beyond: int | None
+    answers: NDArray[np.uint8], pixel: NDArray[np.float64], beyond: int | None
 ) -> NDArray[np.float64]:
     """Return the first moment (2,) of a silhouette about a pixel; of length 1 at a straight rim.
 
-    Beyond its border the silhouette is `beyond`, or None: as at the border.
+    Beyond its border, and where nothing was recorded, the silhouette is `beyond`, or None: as at
+    the border.
     """
-    height, width = mask.shape
+    height, width = answers.shape
     reach = np.arange(-int(WINDOW_PX) - 1, int(WINDOW_PX) + 2)
     columns = int(np.floor(pixel[0])) + reach
     rows = int(np.floor(pixel[1])) + reach
     x, y = columns + 0.5 - pixel[0], rows + 0.5 - pixel[1]
     weight = np.maximum(1.0 - (x**2 + (y**2)[:, None]) / WINDOW_PX**2, 0.0)
-    window = mask[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)]
+    window = answers[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)]
     if beyond is not None:
         window[:, (columns < 0) | (columns >= width)] = beyond
         window[(rows < 0) | (rows >= height)] = beyond
+    is_unseen = window == UNSEEN
+    if is_unseen.any():
+        window[is_unseen] = _nearest(window, is_unseen) if beyond is None else beyond
     # Of the pixels that are fewer: those of a whole disc do not balance about every point.
     on_object = weight * window
     weight = on_object if 2 * on_object.sum() <= weight.sum() else on_object - weight
     # A half plane's moment is the integral of (1 - r^2 / R^2) r sin over half a disc: 4/15 R^3.
     return np.array([weight.sum(axis=0) @ x, weight.sum(axis=1) @ y]) / (4 / 15 * WINDOW_PX**3)
+
+
+def _nearest(window: NDArray[np.uint8], is_unseen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return for each unseen pixel of a window, row by row, what the nearest other one holds.
+
+    Background where there is no other.
+    """
+    seen = np.argwhere(~is_unseen)
+    if len(seen) == 0:
+        return np.zeros(np.count_nonzero(is_unseen), np.uint8)
+    apart = ((np.argwhere(is_unseen)[:, None] - seen) ** 2).sum(axis=2)
+    nearest = seen[apart.argmin(axis=1)]
+    return np.asarray(window[nearest[:, 0], nearest[:, 1]])

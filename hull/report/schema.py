@@ -662,10 +662,12 @@ _DOUBT: "tuple[Column[Doubt], ...]" = (
     Column(
         "component",
         "1",
-        "bound",
-        "the volume of the hull that touches or is nearest; real: it holds something real, given "
-        "right silhouettes; unsure: other volumes explain all that it does, as of a phantom; empty "
-        "of objects too far away to be looked at closely",
+        "estimate",
+        "the connected volume of the hull, in cells of some centimetres and with silhouettes grown "
+        "by a pixel, that touches or is nearest; real: somewhere it holds something real, given "
+        "right silhouettes, which need not be where it touches (a phantom that a thin neck joins "
+        "to a person is of one volume with them); unsure: other volumes explain all that it does, "
+        "as of a phantom; empty of objects too far away to be looked at closely",
         str,
         lambda doubt: doubt.component,
     ),

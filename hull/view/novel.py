@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.silhouettes import BACKGROUND, Hull
 from hybridve.hull.view.cells import Cells, hull_cells
 
 #: By how many pixels of a camera the device may find the surface too late; novel.frag.glsl.
@@ -30,6 +30,9 @@ NEVER_M = 3.0e38
 #: Width of the blur from which surface normals come, in pixels of the silhouette: a staircase of
 #: pixels at any slope is level at this scale, and a finger is not yet lost.
 _SOFT_SIGMA_PX = 2.5
+
+#: Added to the distances of pixels that were not recorded; UNRECORDED in hull.common.glsl.
+_UNRECORDED = np.uint8(128)
 
 #: Margin around a silhouette's bounding box, in pixels, so that its blur fades out.
 _MARGIN_PX = 10
@@ -255,6 +258,7 @@ class HullOnDevice:
             program,
             n_cameras=self._n_cameras,
             keeps=self._views.unseen == "keep",
+            has_gaps=self._views.seen is not None,
             min_cameras=self._views.min_cameras,
             box_low=tuple(low),
             box_high=tuple(high),
@@ -358,7 +362,14 @@ def _region(hull: Hull, camera: int) -> _Region | None:
     mask = hull.mask(camera)
     if hull.views.unseen == "keep":
         # Beyond the border the camera abstains: a ray may become free there.
-        distance = np.ascontiguousarray(_distance(np.pad(1 - mask, 1))[1:-1, 1:-1])
+        background = np.equal(hull.answers(camera), BACKGROUND).view(np.uint8)
+        distance = np.ascontiguousarray(_distance(np.pad(background, 1))[1:-1, 1:-1])
+        if hull.views.seen is not None:
+            distance = np.minimum(distance, _UNRECORDED - 1)
+        seen = hull.views.seen_mask(camera)
+        if seen is not None:
+            to_seen = np.minimum(_distance(1 - seen), _UNRECORDED - 1)
+            distance = np.where(seen, distance, to_seen + _UNRECORDED)
         height, width = mask.shape
         window = np.array([0, 0, width, height])
         return _Region(distance, _blurred(mask), np.zeros(2, np.int64), window)

@@ -3,13 +3,20 @@
 Nothing here uses the code under test beyond building its inputs and projecting in plain float64.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.query.engine import Hits, Triangles
-from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull, make_views
+from hybridve.hull.query.silhouettes import (
+    Hull,
+    Unseen,
+    Views,
+    make_hull,
+    make_seen,
+    make_views,
+)
 from hybridve.hull.query.viewport import sample_positions
 
 #: Engines may differ for samples that project this near to a pixel edge (DESIGN.md, part 5).
@@ -141,8 +148,14 @@ def random_views(
     min_cameras: int = 1,
     largest_px: int = 160,
     origin_world: NDArray[np.float64] | None = None,
+    *,
+    gaps: bool = True,
 ) -> Views:
-    """Return cameras around the origin, 1.5 to 6 m away, of unequal image size and any roll."""
+    """Return cameras around the origin, 1.5 to 6 m away, of unequal image size and any roll.
+
+    Where they may abstain, half of the rigs have cameras that did not record all of their images,
+    unless without `gaps`.
+    """
     sizes, matrices = [], []
     for _ in range(n_cameras):
         width, height = rng.integers(8, largest_px, 2)
@@ -157,7 +170,27 @@ def random_views(
     if origin_world is not None:
         matrices[:, :, 3] -= matrices[:, :, :3] @ origin_world
     names = tuple(f"cam{k}" for k in range(n_cameras))
-    return make_views(names, np.array(sizes), matrices, unseen, min_cameras)
+    views = make_views(names, np.array(sizes), matrices, unseen, min_cameras)
+    has_gaps = gaps and unseen == "keep" and rng.random() < 0.5
+    return with_gaps(rng, views) if has_gaps else views
+
+
+#: What of a pinhole image was recorded: a circle, all but some holes, part of it, all, or nothing.
+_SEEN_KINDS = ("circle", "circle", "holes", "blobs", "half", "noise", "full", "empty")
+
+
+def with_gaps(rng: np.random.Generator, views: Views) -> Views:
+    """Return cameras that abstain with pixels in their images that were not recorded."""
+    masks = []
+    for camera, kind in enumerate(rng.choice(_SEEN_KINDS, len(views)).tolist()):
+        width, height = views.sizes_px[camera]
+        if kind == "circle":  # of a fisheye, which the image may cut
+            x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+            radius = rng.uniform(0.3, 0.6) * max(width, height)
+            masks.append((x - width / 2) ** 2 + (y - height / 2) ** 2 < radius**2)
+        else:
+            masks.append(random_masks(rng, views, [kind] * len(views))[camera] > 0)
+    return replace(views, seen=make_seen(views.names, views.sizes_px, masks))
 
 
 def large_views(rng: np.random.Generator) -> Views:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.hulls import MASK_KINDS, random_masks, random_views
+from helpers.hulls import MASK_KINDS, look_at, projection, random_masks, random_views, with_gaps
 from helpers.polytopes import depth_in_box, distance_between, rectangle_hull
 from numpy.typing import NDArray
 
@@ -11,7 +11,7 @@ from hybridve.hull.capture.synth.meshes import box_mesh
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.query.cells import make_cell_frame, split_cells
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 
 #: The exact answers come from solvers that bound their own error; a tenth of the tolerance.
 SOLVER_M = 1e-5
@@ -107,6 +107,45 @@ def test_no_point_of_any_hull_is_nearer_than_the_lower_bound(seed: int) -> None:
         points = around + spread * rng.normal(size=(3000, 3))
         inside = contains_points(hull, points + origin)
         assert (box.signed_distance(points[inside]) >= near - 1e-9).all()
+
+
+def _narrow_views(rng: np.random.Generator) -> Views:
+    """Cameras that abstain, and that show a part of what is about the origin only."""
+    n_cameras = int(rng.integers(2, 7))
+    sizes, matrices = rng.integers(16, 120, (n_cameras, 2)), []
+    for width, height in sizes.tolist():
+        direction = rng.normal(size=3)
+        center = direction / np.linalg.norm(direction) * rng.uniform(1.5, 4.0)
+        pose = look_at(center, 0.25 * rng.normal(size=3), rng.uniform(0, 6))
+        focal_px = rng.uniform(1.0, 5.0) * max(width, height)
+        matrices.append(projection(pose, focal_px, width, height))
+    names = tuple(f"cam{k}" for k in range(n_cameras))
+    least = int(rng.integers(1, n_cameras + 1))
+    views = make_views(names, sizes, np.array(matrices), "keep", least)
+    return with_gaps(rng, views) if rng.random() < 0.5 else views
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_come_together_where_cameras_see_parts_and_abstain(seed: int) -> None:
+    """Cubes astride what a camera sees must not stay open: it sees no object pixel in its part."""
+    rng = np.random.default_rng([8, seed])
+    tolerance_m, n_found = 1e-3, 0
+    for _ in range(20):
+        views = _narrow_views(rng)
+        kinds = rng.choice(["blobs", "blobs", "half", "holes", "noise"], len(views)).tolist()
+        hull, box = make_hull(views, random_masks(rng, views, kinds)), Box(rng)
+        meter = ClearanceMeter(box.vertices, box.faces, is_closed=True, tolerance_m=tolerance_m)
+
+        found = meter.measure(hull)
+
+        points = box.center + rng.normal(size=(3000, 3)) * 10.0 ** rng.uniform(-2, 0.3, (3000, 1))
+        inside = contains_points(hull, points)
+        assert (box.signed_distance(points[inside]) >= found.signed_m[0] - 1e-9).all()
+        if np.isfinite(found.upper_m):
+            n_found += 1
+            assert contains_points(hull, found.on_hull_world[None])[0]
+            assert found.upper_m - found.lower_m <= tolerance_m + 1e-9
+    assert n_found >= 10
 
 
 @pytest.mark.parametrize("seed", range(10))

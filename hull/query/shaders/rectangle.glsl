@@ -12,10 +12,14 @@
 // | block 0 | cameras   | Camera[n]       | see below                                            |
 // | block 1 | pad_rows  | vec4[2 n]       | pixels times metres, per metre of reach: x, y        |
 // | block 2 | order     | uvec4[n / 4]    | cameras, the one that rejects most first             |
-// | 0       | integrals | int[]           | object pixels above and left of a pixel corner       |
+// | block 3 | recorded  | uvec4[n]        | what a camera recorded: first word in masks, first   |
+// |         |           |                 | number in integrals, then 1, or 0 if that is all     |
+// | 0       | integrals | int[]           | object pixels above and left of a pixel corner; then |
+// |         |           |                 | recorded pixels, of cameras that did not record all  |
 //
 // N_CAMERAS, at least n_cameras, is the room in the blocks: 256 cameras fill 16 KiB, which every
-// device offers. REJECT is 0 where rectangles are to decide nothing.
+// device offers. REJECT is 0 where rectangles are to decide nothing, and GAPS is 1 where some camera
+// did not record all of its image; block 3 is asked then only.
 //
 // The pads of a camera are linear in the reach of a set, its largest absolute coordinates (M in
 // bounds.py). So each set has pads of its own, from its own corners, and a mesh that moves needs
@@ -30,6 +34,9 @@ struct Camera {
 layout(std140, binding = 0) uniform Cameras { Camera cameras[N_CAMERAS]; };
 layout(std140, binding = 1) uniform Pads { vec4 pad_rows[2 * N_CAMERAS]; };
 layout(std140, binding = 2) uniform Order { uvec4 order[N_CAMERAS / 4]; };
+#if GAPS
+layout(std140, binding = 3) uniform Recorded { uvec4 recorded[N_CAMERAS]; };
+#endif
 layout(std430, binding = 0) readonly buffer Integrals { int integrals[]; };
 
 uniform uint n_cameras;
@@ -41,6 +48,7 @@ const uint REJECTS = 0u;    // no sample is inside
 const uint ACCEPTS = 1u;    // every sample is seen, on an object pixel
 const uint ABSTAINS = 2u;   // no sample is seen
 const uint UNDECIDED = 3u;
+const uint WITHHOLDS = 4u;  // no sample is seen on an object pixel; some may be on background
 
 // The same numbers as in hull/query/bounds.py.
 const uint FREE = 0u;
@@ -77,6 +85,14 @@ vec3 pads_of(uint c, vec4 reach_m) {
     return vec3(pad, max(8.0 * max(pad.x, pad.y) / far_px, 1e-30));
 }
 
+// How many pixels of a rectangle an integral image counts, which begins at a number of integrals.
+int count_pixels(uint first, uint stride, ivec2 start, ivec2 stop) {
+    return integrals[first + uint(stop.y) * stride + uint(stop.x)]
+         - integrals[first + uint(start.y) * stride + uint(stop.x)]
+         - integrals[first + uint(stop.y) * stride + uint(start.x)]
+         + integrals[first + uint(start.y) * stride + uint(start.x)];
+}
+
 uint camera_vote(uint c, Extent extent, vec3 pads) {
     if (REJECT == 0) return UNDECIDED;
     vec2 size_px = vec2(cameras[c].image.xy);
@@ -95,19 +111,23 @@ uint camera_vote(uint c, Extent extent, vec3 pads) {
 
     bool wholly_seen = all(greaterThanEqual(first, vec2(0.0))) && all(lessThan(last, size_px));
     uint stride = cameras[c].image.x + 1u;
-    uint base = cameras[c].image.w;
-    int count = integrals[base + uint(stop.y) * stride + uint(stop.x)]
-              - integrals[base + uint(start.y) * stride + uint(stop.x)]
-              - integrals[base + uint(stop.y) * stride + uint(start.x)]
-              + integrals[base + uint(start.y) * stride + uint(start.x)];
-    if (count == 0 && (wholly_seen || keep == 0u)) return REJECTS;
     ivec2 extent_px = stop - start;
-    if (wholly_seen && count == extent_px.x * extent_px.y) return ACCEPTS;
+    int area = extent_px.x * extent_px.y;
+#if GAPS
+    if (recorded[c].z != 0u) {
+        int n_seen = count_pixels(recorded[c].y, stride, start, stop);
+        if (n_seen == 0) return ABSTAINS;
+        wholly_seen = wholly_seen && n_seen == area;
+    }
+#endif
+    int count = count_pixels(cameras[c].image.w, stride, start, stop);
+    if (count == 0) return wholly_seen || keep == 0u ? REJECTS : WITHHOLDS;
+    if (wholly_seen && count == area) return ACCEPTS;
     return UNDECIDED;
 }
 
 // What the votes of all cameras prove, none of which rejects.
-uint verdict(uint n_accept, uint n_abstain) {
-    if (n_cameras - n_abstain < min_cameras) return FREE;
+uint verdict(uint n_accept, uint n_abstain, uint n_withhold) {
+    if (n_cameras - n_abstain - n_withhold < min_cameras) return FREE;
     return n_accept + n_abstain == n_cameras ? FULL : OPEN;
 }

@@ -4,7 +4,7 @@
 //
 // One fragment per sample and pass. What the camera's texel adds to the pixel's counter is
 // blended in, one plus one: nothing on background, nor outside the image, where the border of the
-// texture lies. (To discard such fragments costs a software renderer 6 % more than to add 0.)
+// texture lies, nor on a pixel that was not recorded. (To discard such fragments costs a software renderer 6 % more than to add 0.)
 // The sample is known by the pixel's index in its cell, not by interpolation.
 // NumPy reference: hull/query/reference.py, contains_points().
 //
@@ -13,7 +13,8 @@
 // | binding | name       | type      | unit, frame                                                |
 // |---------|------------|-----------|------------------------------------------------------------|
 // | unit 0  | increments | sampler2D | 1/255 on an object pixel; 0, or 1 with unseen = "keep", on |
-// |         |            |           | background; a border of one texel that is 0                |
+// |         |            |           | background, and 0 on pixels that were not recorded; a      |
+// |         |            |           | border of one texel that is 0                              |
 //
 // ## Numerics
 //

@@ -47,7 +47,7 @@ uint box_verdict(uint cluster) {
         ends[1][axis] = boxes[(3u + axis) * n_clusters + cluster];
     }
     vec4 reach_m = vec4(max(abs(ends[0]), abs(ends[1])), 1.0);
-    uint n_accept = 0u, n_abstain = 0u;
+    uint n_accept = 0u, n_abstain = 0u, n_withhold = 0u;
     for (uint turn = 0u; turn < n_cameras; ++turn) {
         uint k = order[turn / 4u][turn % 4u];
         Extent extent = NOWHERE;
@@ -60,8 +60,9 @@ uint box_verdict(uint cluster) {
         if (vote == REJECTS) return FREE;
         n_accept += uint(vote == ACCEPTS);
         n_abstain += uint(vote == ABSTAINS);
+        n_withhold += uint(vote == WITHHOLDS);
     }
-    return verdict(n_accept, n_abstain);
+    return verdict(n_accept, n_abstain, n_withhold);
 }
 
 void main() {

@@ -56,7 +56,7 @@ uint triangle_verdict(uint triangle) {
     vec3 b = vertex_local(faces[3u * triangle + 1u]);
     vec3 c = vertex_local(faces[3u * triangle + 2u]);
     vec4 reach_m = vec4(max(abs(a), max(abs(b), abs(c))), 1.0);
-    uint n_accept = 0u, n_abstain = 0u;
+    uint n_accept = 0u, n_abstain = 0u, n_withhold = 0u;
     for (uint turn = 0u; turn < n_cameras; ++turn) {
         uint k = order[turn / 4u][turn % 4u];
         Extent extent = NOWHERE;
@@ -67,8 +67,9 @@ uint triangle_verdict(uint triangle) {
         if (vote == REJECTS) return FREE;
         n_accept += uint(vote == ACCEPTS);
         n_abstain += uint(vote == ABSTAINS);
+        n_withhold += uint(vote == WITHHOLDS);
     }
-    return verdict(n_accept, n_abstain);
+    return verdict(n_accept, n_abstain, n_withhold);
 }
 
 void main() {

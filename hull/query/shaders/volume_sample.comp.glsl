@@ -23,7 +23,8 @@
 // | 6       | items          | uvec2[]        | triangle; block row << 16 + block column          |
 // | 7       | counters       | uint[]         | 8 a launch: see hull/query/compute.py             |
 // | 8       | hits           | uvec4[]        | see hull/query/compute.py                         |
-// | 9       | masks          | uint[]         | 1 bit a pixel, row-major, lowest bit first        |
+// | 9       | masks          | uint[]         | 1 bit a pixel, row-major, lowest bit first; then  |
+// |         |                |                | recorded pixels, of cameras with not all of them  |
 // | 10      | origin_world   | double[3]      | metres; where the local frame has its origin      |
 // |         | img_from_local | double[12 n]   | the cameras' projections again, row-major         |
 //
@@ -97,7 +98,7 @@ struct Look {
 shared Look looks[N_CAMERAS];
 shared double projected[9 * N_CAMERAS];
 shared uint undecided[N_CAMERAS];
-shared uint n_undecided, n_accept, n_abstain, n_reject;
+shared uint n_undecided, n_accept, n_abstain, n_withhold, n_reject;
 shared uint rows[BLOCK];        // bit di of rows[dj]: sample (di, dj) of the block is inside
 shared uint run_places[BLOCK];  // where the runs of a row go, among those of the block
 shared uint n_runs, first_run;
@@ -188,6 +189,10 @@ dvec3 projected_row(uint c, uint row) {
     return dvec3(projected[k], projected[k + 1u], projected[k + 2u]);
 }
 
+bool is_set(uint first_word, uint bit) {
+    return (masks[first_word + (bit >> 5)] >> (bit & 31u) & 1u) != 0u;
+}
+
 // Return ACCEPTS on an object pixel, REJECTS on a background pixel, ABSTAINS where not seen.
 uint sample_vote(uint c, int di, int dj) {
     ivec2 size_px = ivec2(cameras[c].image.xy);
@@ -210,8 +215,11 @@ uint sample_vote(uint c, int di, int dj) {
         pixel = ivec2(int(x), int(y));
     }
     uint bit = uint(pixel.y) * uint(size_px.x) + uint(pixel.x);
-    uint word = masks[cameras[c].image.z + (bit >> 5)];
-    return (word >> (bit & 31u) & 1u) != 0u ? ACCEPTS : REJECTS;
+    if (is_set(cameras[c].image.z, bit)) return ACCEPTS;
+#if GAPS
+    if (recorded[c].z != 0u && !is_set(recorded[c].x, bit)) return ABSTAINS;
+#endif
+    return REJECTS;
 }
 
 bool is_inside(int di, int dj) {
@@ -239,7 +247,7 @@ void main() {
         ivec2 first = block * ivec2(items[item].y & 0xffffu, items[item].y >> 16);
         int rest = u - 1 - first.x - first.y;
         if (lane < n_cameras) place_block(triangle, u, first);
-        if (lane == 0u) n_undecided = n_accept = n_abstain = n_reject = n_runs = 0u;
+        if (lane == 0u) n_undecided = n_accept = n_abstain = n_withhold = n_reject = n_runs = 0u;
         for (uint row = lane; row < BLOCK; row += GROUP) rows[row] = 0u;
         barrier();
         for (uint c = lane; c < n_cameras; c += GROUP) {
@@ -247,10 +255,13 @@ void main() {
             if (vote == REJECTS) atomicAdd(n_reject, 1u);
             else if (vote == ACCEPTS) atomicAdd(n_accept, 1u);
             else if (vote == ABSTAINS) atomicAdd(n_abstain, 1u);
-            else undecided[atomicAdd(n_undecided, 1u)] = c;
+            else {
+                if (vote == WITHHOLDS) atomicAdd(n_withhold, 1u);
+                undecided[atomicAdd(n_undecided, 1u)] = c;
+            }
         }
         barrier();
-        uint found = n_reject > 0u ? FREE : verdict(n_accept, n_abstain);
+        uint found = n_reject > 0u ? FREE : verdict(n_accept, n_abstain, n_withhold);
         if (found == FULL) {
             for (uint row = lane; row < BLOCK; row += GROUP) rows[row] = whole_row(rest - int(row));
         } else if (found == OPEN) {

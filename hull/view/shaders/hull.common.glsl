@@ -10,12 +10,15 @@
 // | 0       | cameras   | Camera[]        | rows of pixel-of-region from metres, local frame     |
 // | unit 0  | distances | usampler2DArray | layer = camera; 0 on object pixels, else a distance  |
 // |         |           |                 | to the nearest object pixel, rounded down, at most   |
-// |         |           |                 | 255; with keeps, or to the border of the image       |
+// |         |           |                 | 255; with keeps, or to the border of the image;      |
+// |         |           |                 | with has_gaps at most 127, or to a pixel that was    |
+// |         |           |                 | not recorded, and there UNRECORDED plus the distance |
+// |         |           |                 | to the nearest one that was                          |
 // | unit 1  | soft      | sampler2DArray  | layer = camera; the silhouette blurred, 0 to 1       |
 //
 // A region is the part of a camera's image that its layer holds. Its window, in pixels of the
 // region, is where a point can matter: the bounding box of the silhouette, or, with keeps, the
-// image: outside of it the camera abstains.
+// image: outside of it, and on pixels that were not recorded, the camera abstains.
 
 struct Camera {
     vec4 x, y, z;   // rows of the projection matrix
@@ -28,9 +31,11 @@ layout(binding = 1) uniform sampler2DArray soft;
 
 uniform int n_cameras;     // 0: the hull is empty
 uniform bool keeps;        // unseen = "keep"
+uniform bool has_gaps;     // with keeps: some pixels were not recorded
 uniform int min_cameras;   // with keeps: how many must see a point
 
 const float NEVER = 3.0e38;
+const uint UNRECORDED = 128u;   // the same in hull/view/novel.py
 
 vec3 project(int c, vec3 point) {
     vec4 p = vec4(point, 1.0);
@@ -57,7 +62,9 @@ bool hull_contains(vec3 point) {
                               && all(lessThan(pixel, window.zw));
         if (!sees && !keeps) return false;
         if (sees) {
-            if (distance_at(c, pixel) != 0u) return false;
+            uint away = distance_at(c, pixel);
+            if (has_gaps && away >= UNRECORDED) continue;
+            if (away != 0u) return false;
             ++seen;
         }
     }

@@ -82,6 +82,23 @@ float step_of(float pixels, float speed, float w, float w_slope) {
     return rest > 0.0 ? pixels * w * w / rest : NEVER;
 }
 
+// How far t may grow from a place of the ray, h, in a camera's image until it can come to a pixel
+// that is `away` from the one it is on.
+float step_to(uint away, vec3 start, vec3 slope, vec3 h) {
+    vec2 pixel = h.xy / h.z;
+    vec2 course = slope.xy * start.z - start.xy * slope.z;
+    float speed = length(course);
+    float pixels = float(away) - SAFE_PX;
+    if (away < 3u) {  // to the border of this pixel
+        vec2 unit = course / max(speed, 1e-30);
+        vec2 inner = pixel - floor(pixel);
+        vec2 border = mix(inner, 1.0 - inner, greaterThan(unit, vec2(0.0)));
+        border /= max(abs(unit), vec2(1e-9));
+        pixels = min(border.x, border.y) + OVERSHOOT_PX;
+    }
+    return step_of(pixels, speed, h.z, slope.z);
+}
+
 bool first_surface(vec3 origin, vec3 direction, vec2 range, out float t, out int bounding) {
     bounding = -1;
     t = range.x;
@@ -107,10 +124,12 @@ bool first_surface(vec3 origin, vec3 direction, vec2 range, out float t, out int
             if (t < seen.x && seen.x < seen.y) next_seen = min(next_seen, seen.x);
         }
         uint away = 0u;
-        vec2 pixel = vec2(0.0);
-        if (sees) {
-            pixel = h.xy / h.z;
-            away = distance_at(c, pixel);
+        if (sees) away = distance_at(c, h.xy / h.z);
+        float least = 5e-7 * max(t, 0.1);
+        if (has_gaps && away >= UNRECORDED) {  // it abstains, at least so far
+            sees = false;
+            next_seen = min(next_seen, t + max(step_to(away - UNRECORDED, start, slope, h), least));
+            away = 0u;
         }
         if (away == 0u) {
             ++agreed;
@@ -121,17 +140,7 @@ bool first_surface(vec3 origin, vec3 direction, vec2 range, out float t, out int
             if (next_seen >= end) return false;
             t = max(next_seen, t + 1e-6 * max(t, 1.0));  // no camera speaks sooner
         } else {
-            vec2 course = slope.xy * start.z - start.xy * slope.z;
-            float speed = length(course);
-            float pixels = float(away) - SAFE_PX;
-            if (away < 3u) {  // to the border of this pixel
-                vec2 unit = course / max(speed, 1e-30);
-                vec2 inner = pixel - floor(pixel);
-                vec2 border = mix(inner, 1.0 - inner, greaterThan(unit, vec2(0.0)));
-                border /= max(abs(unit), vec2(1e-9));
-                pixels = min(border.x, border.y) + OVERSHOOT_PX;
-            }
-            t += max(step_of(pixels, speed, h.z, slope.z), 5e-7 * max(t, 0.1));
+            t += max(step_to(away, start, slope, h), least);
             bounding = c;
             if (t >= end) return false;
         }
