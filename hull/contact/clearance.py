@@ -33,6 +33,7 @@ from hybridve.hull.contact.lattice import (
     bound_cells,
 )
 from hybridve.hull.query.cells import CellFrame, are_inside, make_cell_frame, split_cells
+from hybridve.hull.query.engine import checked_vertices
 from hybridve.hull.query.silhouettes import Hull
 
 #: Half of the first root's edge at least, metres, and in sizes of the object. Farther than 16 times
@@ -119,7 +120,7 @@ class ClearanceMeter:
     Raises
     ------
     ValueError
-        If the tolerance is not above 0 or there is no triangle.
+        If the tolerance is not above 0, there is no triangle, or a coordinate is not finite.
     """
 
     def __init__(
@@ -134,6 +135,7 @@ class ClearanceMeter:
             raise ValueError(f"the tolerance is {tolerance_m} m, expected more than 0")
         if len(faces) == 0:
             raise ValueError("the object has no triangle to measure from")
+        vertices_world = checked_vertices(vertices_world)
         used = vertices_world[faces.ravel()]
         self._origin_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
         size_m = float((used.max(axis=0) - used.min(axis=0)).max()) / 2.0
@@ -246,6 +248,8 @@ class ClearanceMeter:
                 asked,
                 best,
             )
+            if half_m < finest_m:
+                self._bound_singly(center, inside, half_m, ~cubes.is_fine[cube], lower_m, best)
             if deepest >= 0:
                 n_looks = _LOOKS if len(center) > _FEW_CELLS else 0
                 self._look_deeper(best, center[deepest], half_m, asked, n_looks)
@@ -262,6 +266,29 @@ class ClearanceMeter:
             ):
                 break
         return float(min(dropped_m, lowest_m))
+
+    def _bound_singly(
+        self,
+        center: NDArray[np.float64],
+        inside: NDArray[np.bool_],
+        half_m: float,
+        is_coarse: NDArray[np.bool_],
+        lower_m: NDArray[np.float64],
+        best: Best,
+    ) -> None:
+        """Raise bounds of cells that no cube of the lattice bounds well, by their own distances.
+
+        The smallest cubes are a share of the root. An object far larger than the room about the
+        hull has a root to match, and one far smaller than a metre a root of metres: cells are then
+        cut on below the smallest cubes.
+        """
+        coarse = np.flatnonzero(is_coarse)
+        signed_m, _ = self._surface.signed(center[coarse])
+        lower_m[coarse] = np.maximum(lower_m[coarse], signed_m - np.sqrt(3.0) * half_m)
+        signed_m[~inside[coarse]] = np.inf
+        nearest = int(signed_m.argmin()) if len(coarse) else -1
+        if nearest >= 0 and signed_m[nearest] < best.distance_m[0]:
+            best.distance_m[0], best.point[:] = signed_m[nearest], center[coarse[nearest]]
 
     def _look_deeper(
         self,
