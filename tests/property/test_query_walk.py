@@ -87,7 +87,7 @@ def test_stretches_are_the_same_in_every_unit_and_place(
     there_matrices[:, :, 3] = unit_m * matrices[:, :, 3] - matrices[:, :, :3] @ shift
     there = make_views(here.names, here.sizes_px, there_matrices)
     hull_here, hull_there = make_hull(here, masks), make_hull(there, masks)
-    for _ in range(20):
+    for _ in range(50):
         camera = int(rng.integers(len(here)))
         corner = np.append(rng.integers(0, here.sizes_px[camera] + 1), 1.0)
         ray = np.linalg.solve(matrices[camera, :, :3], corner)
