@@ -3,11 +3,12 @@
 # make soak    the property tests with new examples: RUNS=10 times, SEED=1 and up, TESTS=some files
 # make bench   the benchmarks, with the numbers of the README
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
+# make hard-cases   the table of hard cases in tests/README.md: what each column makes of each row
 # make lock    renew requirements.lock after a change of pyproject.toml
 
 BIN := .venv/bin
 
-.PHONY: demo test check pytest soak bench theory lock setup clean
+.PHONY: demo test check pytest soak bench theory hard-cases lock setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -37,6 +38,9 @@ bench: setup
 theory: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/bench_theory.py --processes 2 \
 		-o data/pictures/theory.png
+
+hard-cases: setup
+	PYTHONPATH=tests OPENBLAS_NUM_THREADS=1 $(BIN)/python -m helpers.hard_cases_table
 
 lock: setup
 	$(BIN)/python -m pip install --quiet uv

@@ -169,6 +169,9 @@ def test_what_cannot_be_measured_is_refused() -> None:
         ClearanceMeter(vertices, faces, is_closed=False, tolerance_m=0)
     with pytest.raises(ValueError, match="no triangle"):
         ClearanceMeter(vertices, faces[:0], is_closed=False)
+    vertices[2, 0] = np.nan
+    with pytest.raises(ValueError, match="vertex 2 is not finite"):
+        ClearanceMeter(vertices, faces, is_closed=False)
 
 
 def _segment_distance(

@@ -270,6 +270,18 @@ def test_a_contact_that_does_not_collide_has_no_response() -> None:
         respond(BALL, contact_at(), reference_point_world=np.zeros(3))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_that_are_none_are_named(value: float) -> None:
+    hull = ball_hull(ring_views(), np.zeros(3), 0.2)
+    contact = Contact("", np.zeros((1, 3), np.float32), np.zeros(1, np.uint32))
+    nowhere = np.array([0.0, value, 0.0])
+
+    with pytest.raises(ValueError, match=r"RP_obj is .* expected a finite point"):
+        respond(hull, contact, reference_point_world=nowhere)
+    with pytest.raises(ValueError, match=r"CP_obj is .* expected a finite point"):
+        respond(hull, contact, reference_point_world=np.ones(3), cp_obj_world=nowhere)
+
+
 def test_a_known_point_of_contact_and_direction_are_taken_as_they_are() -> None:
     contact = contact_at((0.1, 0, 0))
     start = np.array([0.0, 0.1, 0.05])

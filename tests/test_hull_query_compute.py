@@ -32,7 +32,7 @@ from hybridve.hull.query import compute as compute_module
 from hybridve.hull.query import device as device_module
 from hybridve.hull.query.bounds import OPEN, ROUNDOFF_FLOAT32, rectangle_pads, verdicts
 from hybridve.hull.query.compute import Compute
-from hybridve.hull.query.device import open_device
+from hybridve.hull.query.device import is_software_renderer, open_device
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference
@@ -489,12 +489,56 @@ def test_a_triangle_too_large_for_the_device_is_named(context: moderngl.Context)
 def test_samples_that_32_bits_cannot_count_are_asked_in_batches() -> None:
     before = np.cumsum([0, *[3 << 29] * 3, 1 << 28, 1 << 28, 1 << 28])
 
-    batches = compute_module._batches([before, before])
+    batches = compute_module._batches([before, before], [np.array([6]), np.array([4, 6])])
 
     samples = [sum(int(before[x.stop] - before[x.start]) for x in batch) for batch in batches]
     assert max(samples) <= 1 << 31
     covered = [(x.mesh, t) for batch in batches for x in batch for t in range(x.start, x.stop)]
     assert covered == [(mesh, t) for mesh in range(2) for t in range(6)]
+    assert not any(x.mesh == 1 and x.start < 4 < x.stop for batch in batches for x in batch)
+
+
+def test_no_invocation_turns_more_often_than_the_software_renderer_allows(
+    monkeypatch: pytest.MonkeyPatch, context: moderngl.Context
+) -> None:
+    """Mesa's leaves all loops after 65,535 turns, and with them the samples that are left.
+
+    Silhouettes that are boards of chess decide nothing: all cameras are asked of all samples.
+    """
+    monkeypatch.setattr(compute_module, "_SOFTWARE_MAX_GROUPS", 1)
+    views = ring_views(12, 160, 120, 160.0)
+    y, x = np.mgrid[:120, :160]
+    hull = make_hull(views, [((x // 9 + y // 9) % 7 > 0).astype(np.uint8)] * 12)
+    mesh = sphere_mesh(1000, 0.4, viewport=32)
+    with Native(2) as native:
+        (expected,) = native.query(hull, [mesh])
+
+    with Compute(context) as engine:
+        (found,) = engine.query(hull, [mesh])
+
+    assert differences(views, mesh, found, expected, EDGE_BAND_PX).outside_band == []
+    assert len(expected) > 10_000
+
+
+def test_a_viewport_that_the_software_renderer_would_not_sample_to_its_end_is_named(
+    context: moderngl.Context,
+) -> None:
+    views = ring_views()
+    hull = ball_hull(views, np.zeros(3), 0.2)
+    corners = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0]])
+    viewports = np.array([9000, 12_000], np.int32)
+    mesh = Triangles(corners, np.array([[0, 1, 2]] * 2, np.int32), viewports)
+    with Compute(context) as engine:
+        if not is_software_renderer(engine.renderer):
+            pytest.skip("hardware has no such limit")
+        with pytest.raises(DeviceError, match=r"triangle 1 has a viewport of 12000.*native"):
+            engine.query(hull, [mesh])
+
+
+def test_more_cameras_than_a_work_group_has_room_for_are_named(context: moderngl.Context) -> None:
+    hull = ball_hull(ring_views(257, 8, 6, 8.0), np.zeros(3), 0.2)
+    with Compute(context) as engine, pytest.raises(DeviceError, match=r"257 cameras.*256.*native"):
+        engine.query(hull, [sphere_mesh(10)])
 
 
 def test_what_belonged_to_a_mesh_leaves_the_device_with_it(compute: Compute) -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query import compute as compute_module
 from hybridve.hull.query.choose import open_engine
-from hybridve.hull.query.engine import Hits, Triangles
+from hybridve.hull.query.engine import MAX_COORDINATE_M, Hits, Triangles
 
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -20,6 +20,11 @@ VIEWPORTS = np.array([10, 4], np.int32)
     [
         ("vertices_world", VERTICES * [1, np.nan, 1], r"vertex 0 is not finite"),
         ("vertices_world", np.where(VERTICES == 1, -np.inf, VERTICES), r"vertex 1 is not finite"),
+        (
+            "vertices_world",
+            np.where(VERTICES == 1, -2e18, VERTICES),
+            r"vertex 1 is .* within 1e\+18",
+        ),
         ("vertices_world", np.zeros((4, 2)), r"vertices_world has shape \(4, 2\), expected"),
         (
             "faces",
@@ -43,8 +48,8 @@ def test_a_mesh_that_cannot_be_sampled_is_refused_by_name(
         Triangles(**fields)
 
 
-def test_a_mesh_with_coordinates_whose_sum_overflows_is_taken() -> None:
-    assert len(Triangles(VERTICES * 1e308, FACES, VIEWPORTS)) == 2
+def test_a_mesh_is_taken_up_to_the_largest_coordinates() -> None:
+    assert len(Triangles(VERTICES * MAX_COORDINATE_M, FACES, VIEWPORTS)) == 2
 
 
 def test_an_empty_mesh_is_a_mesh() -> None:

@@ -99,6 +99,18 @@ def test_a_camera_without_an_optical_axis_is_named() -> None:
         make_views(NAMES, SIZES, matrices)
 
 
+@pytest.mark.parametrize(
+    ("value", "name"), [(np.nan, "not finite"), (np.inf, "not finite"), (0.0, "singular")]
+)
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_a_projection_that_is_none_is_named(row: int, value: float, name: str) -> None:
+    matrices = ring_matrices(3, np.zeros(3))
+    matrices[2, row, :3] = value
+
+    with pytest.raises(ValueError, match=f"camera c: the projection matrix is {name}"):
+        make_views(NAMES, SIZES, matrices)
+
+
 def test_integral_images_count_the_object_pixels_of_rectangles() -> None:
     rng = np.random.default_rng(0)
     views = make_views(NAMES, np.array([[7, 5], [3, 9], [1, 1]]), ring_matrices(3, np.zeros(3)))

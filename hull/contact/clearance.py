@@ -33,6 +33,7 @@ from hybridve.hull.contact.lattice import (
     bound_cells,
 )
 from hybridve.hull.query.cells import CellFrame, are_inside, make_cell_frame, split_cells
+from hybridve.hull.query.engine import checked_vertices
 from hybridve.hull.query.silhouettes import Hull
 
 #: Half of the first root's edge at least, metres, and in sizes of the object. Farther than 16 times
@@ -188,8 +189,8 @@ class ClearanceMeter:
     Raises
     ------
     ValueError
-        If the tolerance is not above 0, there is no triangle, or a surface that is said to be
-        closed is not.
+        If the tolerance is not above 0, there is no triangle, a coordinate is not finite, or a
+        surface that is said to be closed is not.
 
     Attributes
     ----------
@@ -213,6 +214,7 @@ class ClearanceMeter:
             raise ValueError(f"the tolerance is {tolerance_m} m, expected more than 0")
         if len(faces) == 0:
             raise ValueError("the object has no triangle to measure from")
+        vertices_world = checked_vertices(vertices_world)
         used = vertices_world[faces.ravel()]
         self._origin_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
         size_m = float((used.max(axis=0) - used.min(axis=0)).max()) / 2.0
@@ -365,7 +367,8 @@ class ClearanceMeter:
         half_m, cubes = level.half_m / 2.0, level.cubes
         whole, center, inside = split_cells(level.center, half_m, asked)
         cube = level.cube[whole]
-        if half_m >= self._roots_m[-1] / 2.0**FINEST_LEVEL:
+        is_finest = half_m < self._roots_m[-1] / 2.0**FINEST_LEVEL
+        if not is_finest:
             own = ~cubes.is_fine[cube]
             cube[own] = len(cubes.half_m) + np.arange(int(own.sum()))
             more = self._lattice.cubes(center[own], half_m, _FINE * self.tolerance_m)
@@ -382,6 +385,8 @@ class ClearanceMeter:
             asked,
             best,
         )
+        if is_finest:
+            self._bound_singly(center, inside, half_m, ~cubes.is_fine[cube], lower_m, best)
         return _Level(center, half_m, cube, cubes), lower_m, deepest
 
     def _refine(
@@ -415,6 +420,29 @@ class ClearanceMeter:
             ):
                 break
         return float(min(dropped_m, lowest_m))
+
+    def _bound_singly(
+        self,
+        center: NDArray[np.float64],
+        inside: NDArray[np.bool_],
+        half_m: float,
+        is_coarse: NDArray[np.bool_],
+        lower_m: NDArray[np.float64],
+        best: Best,
+    ) -> None:
+        """Raise bounds of cells that no cube of the lattice bounds well, by their own distances.
+
+        The smallest cubes are a share of the root. An object far larger than the room about the
+        hull has a root to match, and one far smaller than a metre a root of metres: cells are then
+        cut on below the smallest cubes.
+        """
+        coarse = np.flatnonzero(is_coarse)
+        signed_m, _ = self._surface.signed(center[coarse])
+        lower_m[coarse] = np.maximum(lower_m[coarse], signed_m - np.sqrt(3.0) * half_m)
+        signed_m[~inside[coarse]] = np.inf
+        nearest = int(signed_m.argmin()) if len(coarse) else -1
+        if nearest >= 0 and signed_m[nearest] < best.distance_m[0]:
+            best.distance_m[0], best.point[:] = signed_m[nearest], center[coarse[nearest]]
 
     def _look_deeper(
         self,

@@ -15,7 +15,7 @@ from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.certify import COLLIDING, FREE, Certifier
 from hybridve.hull.query.clusters import spatial_order
-from hybridve.hull.query.engine import Engine, Hits, Triangles
+from hybridve.hull.query.engine import Engine, Hits, Triangles, checked_vertices
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import place_runs, sample_positions, viewports_for_accuracy
@@ -134,21 +134,25 @@ def make_body(
     Raises
     ------
     ValueError
-        If both are given or none, or the accuracy needs a viewport too large.
+        If both are given or none, the accuracy needs a viewport too large, a coordinate is not
+        finite, or there is no triangle.
     """
     if (viewport is None) == (accuracy_m is None):
         raise ValueError("give either viewport or accuracy_m")
-    corners = scene_object.vertices_world[scene_object.faces]  # (T, 3, 3)
+    if len(scene_object.faces) == 0:
+        raise ValueError("there is no triangle to lay into a viewport")
+    vertices_world = checked_vertices(scene_object.vertices_world)
+    corners = vertices_world[scene_object.faces]  # (T, 3, 3)
     if accuracy_m is not None:
         viewports = viewports_for_accuracy(corners, accuracy_m)
     else:
         viewports = np.full(len(corners), viewport, np.int32)
     edges_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     lower, upper = scene_object.box_world
-    order = spatial_order(scene_object.vertices_world, scene_object.faces)
+    order = spatial_order(vertices_world, scene_object.faces)
     return Body(
         scene_object.name,
-        Triangles(scene_object.vertices_world, scene_object.faces[order], viewports[order]),
+        Triangles(vertices_world, scene_object.faces[order], viewports[order]),
         order.astype(np.uint32),
         lower,
         upper,

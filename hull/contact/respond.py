@@ -167,13 +167,17 @@ def respond(
     Raises
     ------
     ValueError
-        If the contact has neither points nor a witness and no CP_obj is given, or the recovery
-        direction has no length.
+        If the contact has neither points nor a witness and no CP_obj is given, the recovery
+        direction has no length, or a point is not finite.
     """
     if settings is None:
         settings = ResponseSettings()
+    if not np.isfinite(reference_point_world).all():
+        raise ValueError(f"RP_obj is {reference_point_world}, expected a finite point")
     if cp_obj_world is None:
         cp_obj_world = collision_point(contact, reference_point_world)
+    if not np.isfinite(cp_obj_world).all():
+        raise ValueError(f"CP_obj is {cp_obj_world}, expected a finite point")
     same_m = max(
         _SAME_POINT * float(np.abs(cp_obj_world).max()),
         _SAME_IN_CAD * float((contact.body.upper_world - contact.body.lower_world).max()),

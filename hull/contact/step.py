@@ -255,12 +255,8 @@ def _points_between(part: Part) -> NDArray[np.float64]:
 
 def _farthest(points: NDArray[np.float64], part: Part) -> float:
     """Return the farthest that one of the points (N, 3) is from the triangles of a part."""
-    import igl  # late: the import takes a fifth of a second
+    from hybridve.hull.contact.distance import SurfaceDistance  # late: it brings compiled code
 
-    vertices = np.ascontiguousarray(part.vertices)
-    faces = np.ascontiguousarray(part.faces, np.int64)
-    tree = igl.AABB()
-    tree.init(vertices, faces)
-    some = np.ascontiguousarray(points[:: 1 + len(points) // _N_MEASURED])
-    squared, _, _ = tree.squared_distance(vertices, faces, some)
-    return float(np.sqrt(np.max(squared, initial=0.0)))
+    surface = SurfaceDistance(part.vertices, part.faces, is_closed=False)
+    distance, _, _ = surface.closest(points[:: 1 + len(points) // _N_MEASURED])
+    return float(distance.max(initial=0.0))

@@ -56,6 +56,12 @@ _GROUP_SIZE, _SOFTWARE_GROUP_SIZE = 64, 8
 #: Work groups of one dispatch; more are strided over. Every device takes 65535. To start one costs
 #: Mesa's software renderer some 70 ns, as much as a few lines of shader.
 _MAX_GROUPS, _SOFTWARE_MAX_GROUPS = 65_535, 4096
+#: Cameras that a work group's memory has room for: see volume_sample.comp.glsl.
+_MOST_CAMERAS = 256
+#: Mesa's software renderer leaves all loops of an invocation for good once they have turned 65,535
+#: times together, without a word: what is behind is never asked. So no invocation may have more
+#: turns than this, with room to spare, and launches are cut accordingly.
+_SOFTWARE_MAX_TURNS = 60_000
 #: Samples of one batch of launches: their counters are 32-bit.
 _MAX_SAMPLES = 1 << 31
 #: Bytes that the buffers of survivors and of hits begin with.
@@ -110,11 +116,14 @@ class _Surface:
     """What is on the device of all meshes that differ in nothing but their vertices.
 
     `spare` are the placements of meshes that are gone: the next vertices go into their buffers.
+    `blocks_before` are the blocks of the triangles before each, (T + 1,).
     """
 
     faces: moderngl.Buffer
     viewports: moderngl.Buffer
     n_triangles: int
+    largest_viewport: int
+    blocks_before: NDArray[np.int64]
     placements: list[_Placement]
     spare: list[_Placement]
 
@@ -174,9 +183,9 @@ class Compute(Closing):
         self._context = open_device() if context is None else context
         self.renderer = renderer_name(self._context)
         self._largest = int(self._context.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
-        is_software = is_software_renderer(self.renderer)
-        self._group_size = _SOFTWARE_GROUP_SIZE if is_software else _GROUP_SIZE
-        self._max_groups = _SOFTWARE_MAX_GROUPS if is_software else _MAX_GROUPS
+        self._is_software = is_software_renderer(self.renderer)
+        self._group_size = _SOFTWARE_GROUP_SIZE if self._is_software else _GROUP_SIZE
+        self._max_groups = _SOFTWARE_MAX_GROUPS if self._is_software else _MAX_GROUPS
         self._reject = reject
         self._programs: dict[tuple[int, bool], _Programs] = {}
         self._placing: tuple[moderngl.ComputeShader, moderngl.ComputeShader] | None = None
@@ -204,7 +213,10 @@ class Compute(Closing):
             self._upload_hull(hull)
         for mesh in meshes:
             self._place(hull.views, mesh)
-        batches = _batches([mesh.topology.samples_before for mesh in meshes])
+        batches = _batches(
+            [mesh.topology.samples_before for mesh in meshes],
+            [self._launch_ends(hull.views, mesh.topology) for mesh in meshes],
+        )
         hits = np.concatenate(
             [np.zeros((0, 4), np.uint32), *(self._run(hull.views, meshes, b) for b in batches)]
         )
@@ -257,8 +269,13 @@ class Compute(Closing):
         Raises
         ------
         DeviceError
-            If the driver does not.
+            If the driver does not, or there are more cameras than a work group has room for.
         """
+        if n_cameras > _MOST_CAMERAS:
+            raise DeviceError(
+                f"{n_cameras} cameras, but the compute engine has room for {_MOST_CAMERAS}; "
+                "take --engine native"
+            )
         make_current(self._context)
         room = _room(n_cameras)
         if (room, has_gaps) not in self._programs:
@@ -345,6 +362,42 @@ class Compute(Closing):
         buffer.write(np.ascontiguousarray(array))
         return buffer
 
+    def _launch_ends(self, views: Views, topology: Topology) -> NDArray[np.int64]:
+        """Return at which triangles a launch of a mesh must end, ascending, the last one its end.
+
+        Raises
+        ------
+        DeviceError
+            If a triangle is too large for the software renderer.
+        """
+        surface = self._surfaces[topology]
+        n_cameras, viewport = len(views), surface.largest_viewport
+        if not self._is_software:
+            return np.array([len(topology)])
+        n_lanes, n_edge = self._group_size, -(-viewport // _BLOCK)
+        # Second pass, a part: the cameras, and the items of its largest triangle, row by row.
+        part_turns = 2 * n_cameras + n_edge + n_edge * (n_edge + 1) // 2 + 8
+        # Third pass, an item: the cameras' corners, the samples, of each the cameras, and the runs.
+        n_samples = min(_BLOCK * _BLOCK, viewport * (viewport + 1) // 2)
+        item_turns = 8 * -(-n_cameras // n_lanes) + 128
+        item_turns += -(-n_samples // n_lanes) * (n_cameras + 1)
+        if part_turns > _SOFTWARE_MAX_TURNS:
+            triangle = int(topology.viewports.argmax())
+            raise DeviceError(
+                f"triangle {triangle} has a viewport of {viewport}, more than {self.renderer}, a "
+                "software renderer, samples in one go; take a smaller viewport, or --engine native"
+            )
+        most_items = self._max_groups * max(1, _SOFTWARE_MAX_TURNS // item_turns)
+        most_parts = self._max_groups * (_SOFTWARE_MAX_TURNS // part_turns)
+        most_triangles = max(_CLUSTER, (most_parts * n_lanes // _CLUSTER - 1) * _CLUSTER)
+        before = surface.blocks_before
+        ends = [0]
+        while ends[-1] < len(topology):
+            start = ends[-1]
+            stop = int(np.searchsorted(before, before[start] + most_items, side="right")) - 1
+            ends.append(max(start + 1, min(stop, start + most_triangles)))
+        return np.array(ends[1:], np.int64)
+
     def _place(self, views: Views, mesh: Triangles) -> None:
         """Put a mesh on the device, as far as it is not there."""
         topology = mesh.topology
@@ -355,6 +408,8 @@ class Compute(Closing):
                 self._upload(topology.faces, what),
                 self._upload(topology.viewports, what),
                 len(topology),
+                int(topology.viewports.max(initial=1)),
+                np.concatenate([[0], np.cumsum(_n_blocks(topology.viewports))]),
                 [],
                 [],
             )
@@ -557,8 +612,19 @@ def _set(program: moderngl.ComputeShader, **values: int) -> None:
             program[name] = value
 
 
-def _batches(samples_before: list[NDArray[np.int64]]) -> list[list[_Launch]]:
-    """Return launches that cover all triangles, in batches whose samples 32 bits can count."""
+def _n_blocks(viewports: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return into how many blocks the samples of triangles are cut, (T,)."""
+    n_edge = -(-viewports.astype(np.int64) // _BLOCK)
+    return np.asarray(n_edge * (n_edge + 1) // 2)
+
+
+def _batches(
+    samples_before: list[NDArray[np.int64]], ends: list[NDArray[np.int64]]
+) -> list[list[_Launch]]:
+    """Return launches that cover all triangles, in batches whose samples 32 bits can count.
+
+    No launch reaches beyond one of the ends of its mesh, ascending, the last one that of the mesh.
+    """
     batches: list[list[_Launch]] = []
     room = 0
     for number, before in enumerate(samples_before):
@@ -568,6 +634,7 @@ def _batches(samples_before: list[NDArray[np.int64]]) -> list[list[_Launch]]:
                 batches.append([])
                 room = _MAX_SAMPLES
             stop = int(np.searchsorted(before, before[start] + room, side="right")) - 1
+            stop = min(stop, int(ends[number][np.searchsorted(ends[number], start, side="right")]))
             batches[-1].append(_Launch(number, start, stop))
             room -= int(before[stop] - before[start])
             start = stop

@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import MAX_VIEWPORT, expand_runs, run_ends, samples_before
 
+#: The largest coordinate of a vertex, metres. Squares of what is projected must not overflow in
+#: single precision, in which graphics hardware computes; nobody's CAD is a hundred light years.
+MAX_COORDINATE_M = 1e18
+
 EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 
@@ -65,8 +69,8 @@ class Triangles:
     Raises
     ------
     ValueError
-        If a shape is wrong, a coordinate is not finite, a face names no vertex, or a viewport is
-        not within 1..`MAX_VIEWPORT`.
+        If a shape is wrong, a coordinate is not finite or beyond `MAX_COORDINATE_M`, a face names
+        no vertex, or a viewport is not within 1..`MAX_VIEWPORT`.
     """
 
     vertices_world: NDArray[np.float64]
@@ -75,7 +79,7 @@ class Triangles:
     topology: Topology = field(init=False)
 
     def __post_init__(self) -> None:
-        vertices_world = _checked_vertices(self.vertices_world)
+        vertices_world = checked_vertices(self.vertices_world)
         faces = _private(self.faces, np.int32, (3,), "faces")
         viewports = _private(self.viewports, np.int32, (), "viewports")
         if len(viewports) != len(faces):
@@ -115,7 +119,7 @@ class Triangles:
                 f"expected {self.vertices_world.shape}"
             )
         moved = object.__new__(Triangles)
-        object.__setattr__(moved, "vertices_world", _checked_vertices(vertices_world))
+        object.__setattr__(moved, "vertices_world", checked_vertices(vertices_world))
         for name in ("faces", "viewports", "topology"):
             object.__setattr__(moved, name, getattr(self, name))
         return moved
@@ -129,14 +133,30 @@ class Triangles:
         return self.vertices_world[self.faces]
 
 
-def _checked_vertices(given: NDArray[Any]) -> NDArray[np.float64]:
+def checked_vertices(given: NDArray[Any]) -> NDArray[np.float64]:
+    """Return vertices (V, 3) as an array that cannot be written to, if all are usable numbers.
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong, or a coordinate is not finite or beyond `MAX_COORDINATE_M`: with the
+        vertex's number.
+    """
     vertices_world = _private(given, np.float64, (3,), "vertices_world")
-    # A sum is finite only where every summand is: one pass over millions of coordinates.
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = vertices_world.sum()
-    if not np.isfinite(total) and not np.isfinite(vertices_world).all():
-        vertex = int(np.flatnonzero(~np.isfinite(vertices_world).all(axis=1))[0])
-        raise ValueError(f"vertex {vertex} is not finite: {vertices_world[vertex]}")
+    if len(vertices_world) == 0:
+        return vertices_world
+    # What is not a number is neither above nor below a limit, and hands itself on to both ends.
+    lowest, highest = vertices_world.min(), vertices_world.max()
+    if not (lowest >= -MAX_COORDINATE_M and highest <= MAX_COORDINATE_M):
+        is_usable = np.isfinite(vertices_world).all(axis=1)
+        if not is_usable.all():
+            vertex = int(is_usable.argmin())
+            raise ValueError(f"vertex {vertex} is not finite: {vertices_world[vertex]}")
+        vertex = int(np.abs(vertices_world).max(axis=1).argmax())
+        raise ValueError(
+            f"vertex {vertex} is {vertices_world[vertex]}, "
+            f"expected coordinates within {MAX_COORDINATE_M:.0e} m"
+        )
     return vertices_world
 
 

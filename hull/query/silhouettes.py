@@ -30,6 +30,11 @@ BACKGROUND, OBJECT, UNSEEN = 0, 1, 2
 _ROTATION_TOLERANCE = 1e-6
 
 
+#: The volume that the rows of a projection span, as a share of a box of their lengths: more than
+#: this, or there is no camera. A principal point a thousand focal lengths off leaves 1e-6.
+_SINGULAR = 1e-12
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
     """Which pixels of the pinhole images were recorded; the same for all frames.
@@ -206,15 +211,24 @@ def make_views(
     Raises
     ------
     ValueError
-        If there is no camera, a matrix is singular, or `min_cameras` is not within 1..C.
+        If there is no camera, a matrix is singular or not finite, or `min_cameras` is not within
+        1..C.
     """
     n_cameras = len(names)
     if not 1 <= min_cameras <= n_cameras:
         raise ValueError(f"min_cameras is {min_cameras}, expected 1..{n_cameras}")
-    axes = img_from_world[:, 2, :3]
-    norms = np.linalg.norm(axes, axis=1)
-    if not (norms > 0).all():
-        raise ValueError(f"camera {names[int(norms.argmin())]}: the projection matrix is singular")
+    is_finite = np.isfinite(img_from_world).all(axis=(1, 2))
+    if not is_finite.all():
+        name = names[int(is_finite.argmin())]
+        raise ValueError(f"camera {name}: the projection matrix is not finite")
+    norms = np.linalg.norm(img_from_world[:, :, :3], axis=2)  # (C, 3)
+    units = img_from_world[:, :, :3] / np.where(norms > 0, norms, 1.0)[:, :, None]
+    flatness = np.abs(np.linalg.det(units))
+    if not (flatness > _SINGULAR).all():
+        raise ValueError(
+            f"camera {names[int(flatness.argmin())]}: the projection matrix is singular"
+        )
+    norms = norms[:, 2]
     scaled = img_from_world / norms[:, None, None]
     origin = _origin(scaled) if origin_world is None else origin_world
     img_from_local = scaled.copy()

@@ -246,7 +246,7 @@ class Stencil(Closing):
         if n_cameras > most:
             raise DeviceError(
                 f"{n_cameras} cameras, but the stencil engine counts to {most} with "
-                f'unseen = "{views.unseen}"; take --engine compute or native'
+                f'unseen = "{views.unseen}"; take --engine native'
             )
         return (n_cameras, n_cameras) if most == _FULL else (views.min_cameras, most)
 

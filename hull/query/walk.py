@@ -18,14 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
-from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, UNSEEN, Hull
+from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, UNSEEN, Hull, Views
 
-#: Stretches and gaps shorter than this are not told: rounding makes them where a ray crosses a
-#: column and a row at once. Crossings within the working volume are off by some 1e-15 m.
-ROUNDING_M = 1e-12
+#: Stretches and gaps shorter than `least_stretches` are not told: rounding makes them where a ray
+#: crosses a column and a row at once. As shares of how far cameras and ray lie apart, where
+#: crossings are off by some 2^-52: 1e-12 m in a room; and of how far the world's origin is, where
+#: numbers are coarser: 1e-10 m at 10 km.
+_LEAST_OF_ROOM, _LEAST_OF_WORLD = 2.0**-42, 2.0**-46
 
-#: How far `boundary_cameras` looks to either side of a boundary point.
-_LOOK_M = 1e-9
+#: How far `boundary_cameras` looks to either side of a boundary point, as a share of how far the
+#: cameras are from it: 1e-9 m in a room.
+_LOOK_OF_ROOM = 2.0**-32
 
 #: Less counts as this, lest a pixel be divided by zero.
 _LEAST_DEPTH_M = float(np.finfo(np.float64).tiny)
@@ -62,7 +65,7 @@ def spans_in_hull(
     -------
     (N, 2) float64
         Begin and end of each stretch, in metres from the origin, ascending and apart. Stretches
-        and gaps shorter than `ROUNDING_M` are left out.
+        and gaps shorter than `least_stretches` are left out.
 
     Raises
     ------
@@ -121,6 +124,7 @@ def spans_of_rays(
     spans_m, offset = _walk(
         begin + views.img_from_local[:, :, 3],
         step,
+        least_stretches(views, origins_world),
         float(reach_m),
         np.ascontiguousarray(views.sizes_px),
         hull.answers_flat,
@@ -130,6 +134,28 @@ def spans_of_rays(
         int(views.min_cameras),
     )
     return [spans_m[i:j] for i, j in itertools.pairwise(offset.tolist())]
+
+
+def least_stretches(views: Views, origins_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how long the shortest stretches and gaps are that are told of some rays, (R,) metres.
+
+    Rays that begin at (R, 3) metres, world. In a room it is 1e-12 m; in larger and smaller ones as
+    much larger and smaller, and far from the world's origin what rounding leaves there.
+    """
+    room_m, world_m = _sizes(views, origins_world)
+    return np.asarray(_LEAST_OF_ROOM * room_m + _LEAST_OF_WORLD * world_m)
+
+
+def _sizes(
+    views: Views, points_world: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far cameras and points (N, 3) lie from the local origin together, (N,) metres.
+
+    Then how far the points, or the local origin, lie from that of the world.
+    """
+    local_m = np.abs(points_world - views.origin_world).max(axis=1)
+    world_m = np.maximum(np.abs(points_world).max(axis=1), np.abs(views.origin_world).max())
+    return local_m + np.abs(views.img_from_local[:, 2, 3]).max(), world_m
 
 
 def contains_few(hull: Hull, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -177,7 +203,8 @@ def boundary_cameras(
     """
     views = hull.views
     # Far from the world's origin, numbers are coarser than the step.
-    look_m = _LOOK_M + 64 * np.finfo(np.float64).eps * float(np.abs(point_world).max())
+    (room_m,), (world_m,) = _sizes(views, point_world[None])
+    look_m = _LOOK_OF_ROOM * room_m + _LEAST_OF_WORLD * world_m
     sides = np.array([-look_m, look_m])[:, None] * _unit(direction)
     points_local = point_world - views.origin_world + sides  # (2, 3)
     states = _states(hull, points_local)  # (C, 2)
@@ -428,6 +455,7 @@ def _seen_enough(
 def _walk(
     begin: NDArray[np.float64],
     step: NDArray[np.float64],
+    least_m: NDArray[np.float64],
     reach_m: float,
     sizes: NDArray[np.int64],
     answers: NDArray[np.uint8],
@@ -438,7 +466,8 @@ def _walk(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the stretches (N, 2) of all rays, and where each ray's begin among them (R + 1,).
 
-    The homogeneous projection of a ray's point at t is ``begin + t * step``, (R, C, 3). Camera
+    The homogeneous projection of a ray's point at t is ``begin + t * step``, (R, C, 3); stretches
+    and gaps are told if they are longer than `least_m`, (R,). Camera
     after camera takes away what it sees background in: what one has taken the next need not walk.
     With `has_gaps` some camera has pixels that it did not record.
     """
@@ -520,10 +549,10 @@ def _walk(
         while i < n_left:
             from_m, to_m = left_m[i]
             i += 1
-            while i < n_left and left_m[i, 0] - to_m <= ROUNDING_M:
+            while i < n_left and left_m[i, 0] - to_m <= least_m[ray]:
                 to_m = left_m[i, 1]
                 i += 1
-            if to_m - from_m > ROUNDING_M:
+            if to_m - from_m > least_m[ray]:
                 told_m[n_told, 0], told_m[n_told, 1] = from_m, to_m
                 n_told += 1
         offset[ray + 1] = n_told

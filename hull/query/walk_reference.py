@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.walk import ROUNDING_M
+from hybridve.hull.query.walk import least_stretches
 
 
 def spans_in_hull(
@@ -20,6 +20,7 @@ def spans_in_hull(
     its middle is.
     """
     views = hull.views
+    (least_m,) = least_stretches(views, origin_world[None])
     unit = direction / np.linalg.norm(direction)
     cuts_m = [np.array([0.0, reach_m])]
     for matrix, sizes in zip(views.img_from_local, views.sizes_px.tolist(), strict=True):
@@ -36,9 +37,9 @@ def spans_in_hull(
     inside = contains_points(hull, origin_world + middles_m[:, None] * unit)
     changes = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
     spans_m = np.column_stack([edges_m[changes == 1], edges_m[changes == -1]])
-    is_gap = spans_m[1:, 0] - spans_m[:-1, 1] > ROUNDING_M
+    is_gap = spans_m[1:, 0] - spans_m[:-1, 1] > least_m
     some = np.full(min(len(spans_m), 1), True)
     begins_m = spans_m[np.concatenate([some, is_gap]), 0]
     ends_m = spans_m[np.concatenate([is_gap, some]), 1]
-    is_told = ends_m - begins_m > ROUNDING_M
+    is_told = ends_m - begins_m > least_m
     return np.asarray(np.column_stack([begins_m, ends_m])[is_told])

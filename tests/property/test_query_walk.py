@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.hull.query import walk_reference
-from hybridve.hull.query.silhouettes import Hull, make_hull
-from hybridve.hull.query.walk import spans_in_hull, spans_of_rays
+from hybridve.hull.query.silhouettes import Hull, make_hull, make_views
+from hybridve.hull.query.walk import boundary_cameras, spans_in_hull, spans_of_rays
 
 Rays = tuple[Hull, NDArray[np.float64], NDArray[np.float64]]
 
@@ -64,3 +64,43 @@ def test_a_ray_is_walked_alike_among_others(rays: Rays, seed: int) -> None:
     for spans_m, number in zip(together, order, strict=True):
         alone_m = spans_in_hull(hull, starts[number], 3.0 * units[number], 8.0)
         np.testing.assert_array_equal(spans_m, alone_m)
+
+
+#: A unit in metres, and how far away the scene stands.
+PLACES = ((1e-6, 0.0), (1e3, 0.0), (1e6, 0.0), (1e9, 0.0), (1.0, 1e4), (1.0, 5e6))
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1), place=st.sampled_from(PLACES))
+def test_stretches_are_the_same_in_every_unit_and_place(
+    seed: int, place: tuple[float, float]
+) -> None:
+    """Through corners of pixels, where rounding would tell stretches and gaps that are none."""
+    rng = np.random.default_rng(seed)
+    here = random_views(rng, int(rng.integers(1, 5)))
+    masks = random_masks(rng, here, rng.choice(MASK_KINDS, len(here)).tolist())
+    unit_m, away_m = place
+    shift = away_m * np.array([0.6, -0.7, 0.2])
+    matrices = here.img_from_local.copy()
+    matrices[:, :, 3] -= matrices[:, :, :3] @ here.origin_world
+    there_matrices = matrices.copy()
+    there_matrices[:, :, 3] = unit_m * matrices[:, :, 3] - matrices[:, :, :3] @ shift
+    there = make_views(here.names, here.sizes_px, there_matrices)
+    hull_here, hull_there = make_hull(here, masks), make_hull(there, masks)
+    for _ in range(50):
+        camera = int(rng.integers(len(here)))
+        corner = np.append(rng.integers(0, here.sizes_px[camera] + 1), 1.0)
+        ray = np.linalg.solve(matrices[camera, :, :3], corner)
+        target = camera_center(here, camera) + ray / np.linalg.norm(ray) * rng.uniform(1.0, 6.0)
+        start = 0.2 * rng.normal(size=3)
+        direction = target - start
+
+        spans = spans_in_hull(hull_here, start, direction, 8.0)
+        start_there = unit_m * start + shift
+        spans_m = spans_in_hull(hull_there, start_there, direction, 8.0 * unit_m)
+
+        # At 5,000 km a coordinate is 1e-9 m, seen at a glancing angle.
+        np.testing.assert_allclose(spans_m / unit_m, spans, atol=1e-9 + 1e-12 * away_m, rtol=0)
+        unit = direction / np.linalg.norm(direction)
+        for end_m in spans_m[:, 1][spans_m[:, 1] < 7.99 * unit_m]:
+            assert boundary_cameras(hull_there, start_there + end_m * unit, direction)
