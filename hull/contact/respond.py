@@ -55,10 +55,9 @@ Status = Literal["", "no direction", "no exit", "outside", "no normal"]
 #: were not all found, or span no plane.
 PaperStatus = Literal["", "no direction", "base inside", "outside", "missed", "no normal"]
 
-#: One CP_obj no farther from RP_obj than this has no direction to it but that of rounding: as a
-#: share of its largest coordinate, in double precision; as a share of the object's size, since CAD
-#: files hold vertices in single precision.
-_SAME_POINT, _SAME_IN_CAD = 2.0**-46, 2.0**-22
+#: A collision point is rounded where it is placed. One no farther from RP_obj than this, as a share
+#: of its largest coordinate, has no direction to it but that of its rounding.
+_SAME_POINT = 2.0**-46
 
 #: Two vectors whose angle has no larger sine span no plane.
 _NO_PLANE = 1e-6
@@ -178,11 +177,7 @@ def respond(
         cp_obj_world = collision_point(contact, reference_point_world)
     if not np.isfinite(cp_obj_world).all():
         raise ValueError(f"CP_obj is {cp_obj_world}, expected a finite point")
-    same_m = max(
-        _SAME_POINT * float(np.abs(cp_obj_world).max()),
-        _SAME_IN_CAD * float((contact.body.upper_world - contact.body.lower_world).max()),
-    )
-    v_rec = _recovery_vector(cp_obj_world, reference_point_world, recovery_direction, same_m)
+    v_rec = _recovery_vector(cp_obj_world, reference_point_world, recovery_direction)
     nowhere = np.full(3, np.nan)
     if v_rec is None:
         unknown = (nowhere, nowhere, np.nan)
@@ -234,9 +229,8 @@ def _recovery_vector(
     cp_obj_world: NDArray[np.float64],
     reference_point_world: NDArray[np.float64],
     recovery_direction: NDArray[np.float64] | None,
-    same_m: float,
 ) -> NDArray[np.float64] | None:
-    """Return V_rec as a unit vector, None if CP_obj lies within `same_m` of RP_obj."""
+    """Return V_rec as a unit vector, None if CP_obj lies at RP_obj."""
     if recovery_direction is not None:
         length = float(np.linalg.norm(recovery_direction))
         if not 0 < length < np.inf:
@@ -244,7 +238,7 @@ def _recovery_vector(
         return np.asarray(recovery_direction / length)
     towards = reference_point_world - cp_obj_world
     distance_m = float(np.linalg.norm(towards))
-    if distance_m <= same_m:
+    if distance_m <= _SAME_POINT * float(np.abs(cp_obj_world).max()):
         return None
     return np.asarray(towards / distance_m)
 

@@ -79,6 +79,9 @@ def _look(
         axis=1
     ).astype(np.bool_)
     column, row = np.where(seen[:, None], pixels, 0).astype(np.int64).T
+    recorded = hull.views.seen_mask(camera)
+    if recorded is not None:
+        seen &= recorded[row, column] != 0
     return seen, seen & (hull.mask(camera)[row, column] != 0), edge_px
 
 
