@@ -9,10 +9,12 @@ each that it names:
 * ``"nobody"``: no camera saw anything;
 * ``"silent"``: the hull is empty, and some cameras saw nothing: the emptiness rests on them;
 * ``"within error"``: the hull is empty, but not if silhouettes are grown by their errors;
-* ``"elsewhere"``: the hull of grown silhouettes is empty, too, but where one camera does not see
-  there is a point that all others see: real things may be there (``unseen = "carve"`` only);
-* ``"contradiction"``: it is empty and there is no such point: some silhouette is wrong, or some
-  camera is not where the rig has it, by more than the errors stated;
+* ``"elsewhere"``: the hull of grown silhouettes is empty, too, but every camera has a point on its
+  silhouette that all others see but one, outside of whose image it is: several real things may be
+  there (``unseen = "carve"`` and three cameras or more only: what one of two cameras sees may
+  nearly always be outside of the other's image, somewhere);
+* ``"contradiction"``: it is empty, and some camera has no such point: some silhouette is wrong, or
+  some camera is not where the rig has it, by more than the errors stated;
 * ``"open"``: neither a point was found nor a proof; nothing is claimed.
 
 How far silhouettes are grown (`stated_error_px`) decides between an error and a contradiction:
@@ -42,8 +44,10 @@ from hybridve.hull.agreement.search import (
     OPEN,
     Pencils,
     Rule,
+    Search,
     images_of,
     make_pencils,
+    search,
     search_hull,
 )
 from hybridve.hull.query.silhouettes import Hull, Views
@@ -98,13 +102,13 @@ class Agreement:
     error_px : (C,) int64
         By how much each silhouette may be off.
     point_world : (3,) float64
-        A point of the hull ("agreed"), of the grown hull ("within error"), or one that all see but
-        the cameras `outside` of whose images it is; metres. NaN where there is none.
+        A point of the hull ("agreed"), of the grown hull ("within error"), or one that all others
+        see outside of the images of silent cameras; metres. NaN where there is none.
     silent : tuple of str
         The cameras that saw nothing, whatever the kind.
-    outside : tuple of str
-        Of "silent" and "elsewhere": the cameras outside of whose images is a point that all others
-        see. Silent cameras that are not among them deny all that the others could mean.
+    is_outside : bool or None
+        Of "silent": whether a point that all others see is outside of the silent cameras' images.
+        If not, these deny all that the others could mean. None where neither was proved.
     suspects : tuple of Suspect
         Of "contradiction": who may be wrong, likeliest first; empty where no camera and no pair
         alone explains it: then all are suspect.
@@ -116,7 +120,7 @@ class Agreement:
     error_px: NDArray[np.int64]
     point_world: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.nan))
     silent: tuple[str, ...] = ()
-    outside: tuple[str, ...] = ()
+    is_outside: bool | None = None
     suspects: tuple[Suspect, ...] = ()
     is_empty: bool = False
 
@@ -133,7 +137,9 @@ class Agreement:
         if self.is_sound:
             return ""
         if self.kind == "silent":
-            if set(self.silent) <= set(self.outside):
+            if self.is_outside is None:
+                return f"{silent} saw nothing, while others did"
+            if self.is_outside:
                 where = "what they saw may be outside of its image"
             else:
                 where = "no place that they could mean is outside of its image"
@@ -144,8 +150,8 @@ class Agreement:
             return f"no point is in all silhouettes, unless they are off by up to {most_px} px"
         if self.kind == "elsewhere":
             return (
-                f"no point is in all silhouettes; what all others saw may be outside of the image "
-                f"of {' or '.join(self.outside)}"
+                "no point is in all silhouettes; what each camera saw may be outside of the image "
+                "of one other"
             )
         if self.kind == "open":
             return "neither a point of the hull was found, nor that there is none"
@@ -234,44 +240,53 @@ def judge_frame(
     if len(silent):
         if plain.verdict == OPEN:
             return told
-        outside, point = _outside(hull, pencils, rule, [tuple(silent.tolist())])
-        return replace(told, kind="silent", outside=outside, point_world=point)
+        apart = _apart(hull, pencils, rule, silent)
+        return replace(
+            told,
+            kind="silent",
+            is_outside=None if apart.verdict == OPEN else apart.verdict == FOUND,
+            point_world=apart.point_world,
+        )
     grown = search_hull(hull, pencils, rule)
     if grown.verdict == FOUND and told.is_empty:
         return replace(told, kind="within error", point_world=grown.point_world)
     if grown.verdict != EMPTY:
         return told
-    outside, point = _outside(hull, pencils, rule, [(camera,) for camera in range(count)])
-    if outside:
-        return replace(told, kind="elsewhere", outside=outside, point_world=point, is_empty=True)
-    suspects = _suspects(hull, pencils, rule)
-    return replace(told, kind="contradiction", suspects=suspects, is_empty=True)
+    told = replace(told, is_empty=True)
+    elsewhere = _elsewhere(hull, pencils, rule)
+    if elsewhere != EMPTY:
+        return replace(told, kind="elsewhere") if elsewhere == FOUND else told
+    return replace(told, kind="contradiction", suspects=_suspects(hull, pencils, rule))
 
 
 def _names(views: Views, cameras: Sequence[int] | NDArray[np.int64]) -> tuple[str, ...]:
     return tuple(views.names[camera] for camera in cameras)
 
 
-def _outside(
-    hull: Hull, pencils: Pencils, rule: Rule, groups: Sequence[tuple[int, ...]]
-) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-    """Return the cameras outside of whose images is a point that all others see, and one such."""
-    outside: list[str] = []
-    point_world = np.full(3, np.nan)
-    if hull.views.unseen == "keep":  # whoever does not see abstains already
-        return (), point_world
-    for group in groups:
-        if len(group) == len(hull.views):
-            continue
-        abstains = rule.abstains.copy()
-        abstains[list(group)] = True
-        found = search_hull(
-            hull, pencils, replace(rule, abstains=abstains, needed=rule.needed - len(group))
-        )
-        if found.verdict == FOUND:
-            outside += _names(hull.views, group)
-            point_world = found.point_world
-    return tuple(outside), point_world
+def _apart(hull: Hull, pencils: Pencils, rule: Rule, silent: NDArray[np.int64]) -> Search:
+    """Look for a point that the others see, outside of the images of silent cameras."""
+    abstains = rule.abstains.copy()
+    abstains[silent] = True
+    # Where cameras abstain by the session's rule, the silent ones have done so already.
+    needed = rule.needed if hull.views.unseen == "keep" else rule.needed - len(silent)
+    return search_hull(hull, pencils, replace(rule, abstains=abstains, needed=needed))
+
+
+def _elsewhere(hull: Hull, pencils: Pencils, rule: Rule) -> int:
+    """Tell whether each camera has a point that all others see but one, which does not see there.
+
+    `FOUND` if each has, `EMPTY` if one is proved to have none.
+    """
+    count = len(hull.views)
+    if hull.views.unseen == "keep" or count < 3:
+        return EMPTY
+    anywhere = replace(rule, abstains=np.ones(count, np.bool_), needed=count - 1)
+    verdicts = []
+    for camera in range(count):
+        verdicts.append(search(hull, pencils, camera, anywhere).verdict)
+        if verdicts[-1] == EMPTY:
+            return EMPTY
+    return FOUND if all(verdict == FOUND for verdict in verdicts) else OPEN
 
 
 def _suspects(hull: Hull, pencils: Pencils, rule: Rule) -> tuple[Suspect, ...]:
@@ -339,6 +354,16 @@ def object_pixels(hull: Hull, camera: int, count: int) -> NDArray[np.float64]:
         for row, rank in zip(rows, ranks, strict=True)
     ]
     return np.column_stack([columns, rows]) + 0.5 if area else np.zeros((0, 2))
+
+
+def deniers(found: Sequence[Dispute]) -> tuple[str, ...]:
+    """Return the cameras that deny pieces of two others' silhouettes at least.
+
+    One camera may see too much, a shadow or a reflection; what two see and one denies is more
+    likely lacking in that one.
+    """
+    named = [name for dispute in found for name in dispute.denied_by]
+    return tuple(sorted({name for name in named if named.count(name) > 1}))
 
 
 def disputes(
