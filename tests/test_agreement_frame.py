@@ -173,8 +173,9 @@ def horizon_strips(above_px: int, below_px: int) -> Hull:
     ]
     views = make_views(("a", "b"), np.array([[width, height]] * 2), np.array(matrices))
     upper, lower = np.zeros((height, width), np.uint8), np.zeros((height, width), np.uint8)
-    upper[: height // 2 - above_px] = 1
-    lower[height // 2 + below_px :] = 1
+    # Clear of the borders, however much they are grown here.
+    upper[15 : height // 2 - above_px, 15:-15] = 1
+    lower[height // 2 + below_px : -15, 15:-15] = 1
     return make_hull(views, [upper, lower])
 
 
@@ -216,7 +217,7 @@ def test_what_one_camera_does_not_see_is_elsewhere() -> None:
     told = judge_frame(cropped(views, masks, windows), 1)
 
     assert (told.kind, told.is_empty, told.is_sound) == ("elsewhere", True, False)
-    assert "may be outside of the image of one other" in told.reason
+    assert "may be outside of each other's images" in told.reason
 
 
 def test_a_thing_that_one_of_four_lacks_is_denied_by_it() -> None:
@@ -281,12 +282,15 @@ def test_outlines_within_their_errors_never_contradict(
     # A pixel more: silhouettes are of pixels' centres.
     told = judge_frame(hull, error_px + 1)
 
-    assert told.kind in {"agreed", "within error", "silent"}
-    assert (told.kind == "silent") == (not all(mask.any() for mask in masks))
+    if all(mask.any() for mask in masks):
+        # What images cut off may leave each camera another part of the ball.
+        is_cut = any(mask[[0, -1]].any() or mask[:, [0, -1]].any() for mask in masks)
+        assert told.kind in {"agreed", "within error"} or (is_cut and told.kind == "elsewhere")
+        assert is_cut or disputes(hull, error_px + 1) == ()
+    else:
+        assert told.kind in {"silent", "nobody"}
     if told.kind == "agreed":
         assert contains_points(hull, told.point_world[None]).all()
-    if told.kind != "silent":
-        assert disputes(hull, error_px + 1) == ()
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(1, 6), keep=st.booleans())

@@ -9,13 +9,22 @@ each that it names:
 * ``"nobody"``: no camera saw anything;
 * ``"silent"``: the hull is empty, and some cameras saw nothing: the emptiness rests on them;
 * ``"within error"``: the hull is empty, but not if silhouettes are grown by their errors;
-* ``"elsewhere"``: the hull of grown silhouettes is empty, too, but every camera has a point on its
-  silhouette that all others see but one, outside of whose image it is: several real things may be
-  there (``unseen = "carve"`` and three cameras or more only: what one of two cameras sees may
-  nearly always be outside of the other's image, somewhere);
-* ``"contradiction"``: it is empty, and some camera has no such point: some silhouette is wrong, or
-  some camera is not where the rig has it, by more than the errors stated;
+* ``"elsewhere"``: the hull of grown silhouettes is empty, too, but what each camera saw may be
+  partly outside of the others' images (``unseen = "carve"`` only);
+* ``"contradiction"``: it is empty, and some camera saw something wholly that no other place
+  explains: some silhouette is wrong, or some camera is not where the rig has it, by more than the
+  errors stated;
 * ``"open"``: neither a point was found nor a proof; nothing is claimed.
+
+What may be elsewhere
+---------------------
+A point that one camera does not see is out of the hull, though a real thing may be there. Where no
+silhouette reaches the border of its image, all things that were seen were seen wholly, and a
+camera's silhouette is taken to be explained by a point on it that all others see but one, at most,
+outside of whose image it is. Where some silhouette is cut off by the border, the thing's parts may
+be seen by different cameras: then two cameras are enough, and a silhouette that is cut off needs no
+explanation itself. It is a contradiction only if a camera is proved to lack that explanation. Still
+it is one by assumption: a thing that stands where a single camera looks looks like one.
 
 How far silhouettes are grown (`stated_error_px`) decides between an error and a contradiction:
 three standard deviations of the outline, so that straight outlines pass it once in 370.
@@ -23,8 +32,8 @@ three standard deviations of the outline, so that straight outlines pass it once
 Who is guilty cannot be proved: the hull of the others is empty, too, if two are wrong, and may hold
 a point by chance. So all are *suspects* without whom the others agree: the hull of the rest,
 grown, holds a point, and at least half of the rays that were tried of the rest's silhouettes meet
-the hull of the rest as it is (an estimate). If none is, all such pairs. He that leaves the others
-in the best agreement leads the list.
+the hull of the rest as it is (an estimate). If none is, all such pairs. Those are named that leave
+the others in the best agreement, or nearly so; with few cameras left, chance agrees, too.
 
 `disputes` looks closer where there is a hull: for large pieces of a silhouette that others deny.
 """
@@ -45,6 +54,7 @@ from hybridve.hull.agreement.search import (
     Pencils,
     Rule,
     Search,
+    bounding_box,
     images_of,
     make_pencils,
     search,
@@ -67,6 +77,9 @@ _EXPLAINED_RAYS = 16
 
 #: The others agree if at least this share of their rays is explained.
 _AGREED_SHARE = 0.5
+
+#: Suspects whose share is this much below the best one's are let go.
+_AS_GOOD = 0.1
 
 #: How far these rays are followed, in depths of the local origin.
 _REACH = 4.0
@@ -150,8 +163,8 @@ class Agreement:
             return f"no point is in all silhouettes, unless they are off by up to {most_px} px"
         if self.kind == "elsewhere":
             return (
-                "no point is in all silhouettes; what each camera saw may be outside of the image "
-                "of one other"
+                "no point is in all silhouettes; what the cameras saw may be outside of each "
+                "other's images"
             )
         if self.kind == "open":
             return "neither a point of the hull was found, nor that there is none"
@@ -273,20 +286,36 @@ def _apart(hull: Hull, pencils: Pencils, rule: Rule, silent: NDArray[np.int64]) 
 
 
 def _elsewhere(hull: Hull, pencils: Pencils, rule: Rule) -> int:
-    """Tell whether each camera has a point that all others see but one, which does not see there.
+    """Tell whether what each camera saw may be outside of others' images.
 
-    `FOUND` if each has, `EMPTY` if one is proved to have none.
+    `EMPTY` if a camera that saw something wholly is proved to have no such explanation.
     """
-    count = len(hull.views)
-    if hull.views.unseen == "keep" or count < 3:
+    views = hull.views
+    count = len(views)
+    if views.unseen == "keep":
         return EMPTY
-    anywhere = replace(rule, abstains=np.ones(count, np.bool_), needed=count - 1)
-    verdicts = []
+    is_cut = [
+        _reaches_border(hull, camera, int(rule.tolerance_px[camera])) for camera in range(count)
+    ]
+    needed = 2 if any(is_cut) else max(2, count - 1)
+    anywhere = replace(rule, abstains=np.ones(count, np.bool_), needed=needed)
+    verdict = FOUND
     for camera in range(count):
-        verdicts.append(search(hull, pencils, camera, anywhere).verdict)
-        if verdicts[-1] == EMPTY:
+        if is_cut[camera]:
+            continue
+        found = search(hull, pencils, camera, anywhere).verdict
+        if found == EMPTY:
             return EMPTY
-    return FOUND if all(verdict == FOUND for verdict in verdicts) else OPEN
+        if found == OPEN:
+            verdict = OPEN
+    return verdict
+
+
+def _reaches_border(hull: Hull, camera: int, grown_px: int) -> bool:
+    """Tell whether a silhouette, grown, reaches the border of its image."""
+    left, right, top, bottom = bounding_box(hull, camera, grown_px)
+    width, height = hull.views.sizes_px[camera].tolist()
+    return left <= 0 or top <= 0 or right >= width or bottom >= height
 
 
 def _suspects(hull: Hull, pencils: Pencils, rule: Rule) -> tuple[Suspect, ...]:
@@ -303,7 +332,9 @@ def _suspects(hull: Hull, pencils: Pencils, rule: Rule) -> tuple[Suspect, ...]:
                 explained = _explained(hull, pencils, group)
                 if explained >= _AGREED_SHARE:
                     found.append(Suspect(_names(hull.views, group), explained))
-    return tuple(sorted(found, key=lambda suspect: -suspect.explained))
+    best = max((suspect.explained for suspect in found), default=0.0)
+    likely = [suspect for suspect in found if suspect.explained >= best - _AS_GOOD]
+    return tuple(sorted(likely, key=lambda suspect: -suspect.explained))
 
 
 def _explained(hull: Hull, pencils: Pencils, group: tuple[int, ...]) -> float:

@@ -173,7 +173,7 @@ class Search:
 
 def make_pencils(views: Views) -> Pencils:
     """Return the rays of all cameras as all cameras see them."""
-    matrices = np.ascontiguousarray(views.img_from_local)
+    matrices = np.array(views.img_from_local, order="C")  # writable, as compiled code expects
     left, last = matrices[:, :, :3], matrices[:, :, 3]
     # Pixels in image widths from the middle: N^-1 (x, y, 1).
     extents = views.sizes_px.max(axis=1).astype(np.float64)
@@ -202,7 +202,7 @@ def make_pencils(views: Views) -> Pencils:
         np.ascontiguousarray(seen),
         np.ascontiguousarray(pads),
         matrices,
-        np.ascontiguousarray(views.sizes_px),
+        np.array(views.sizes_px, order="C"),
     )
 
 
