@@ -22,10 +22,7 @@ from hybridve.hull.agreement.search import (
     counts,
     search_cells,
 )
-from hybridve.hull.jit import compiled
-
-#: Cells after which the search on one block's rays is given up, and the block left alone.
-_MOST_CELLS = 1000
+from hybridve.hull.jit import ZERO, compiled
 
 #: Points of a lattice to each side, and how far apart they are, in sides of a block.
 _LATTICE, _SPACING = 96, 0.5
@@ -159,8 +156,12 @@ def find_blocks(
     needed: int,
     tolerance_px: NDArray[np.int64],
     sides_px: NDArray[np.int64],
+    most_cells: int,
 ) -> Blocks:
-    """Return the blocks of all asked cameras, whose sides are (C,) pixels, and who denies them."""
+    """Return the blocks of all asked cameras, whose sides are (C,) pixels, and who denies them.
+
+    The search on one block's rays is given up after `most_cells`, and the block left alone.
+    """
     sizes, matrices = pencils.sizes, pencils.matrices
     n_cameras = len(sizes)
     # Per block of each camera's grid whether it is confirmed.
@@ -187,7 +188,9 @@ def find_blocks(
         first = images.integral_offset[camera]
         for row in range(rows):
             top = row * side
-            in_row = count_pixels(0, width, top, top + side, width, height, first, images.integrals)
+            in_row = count_pixels(
+                ZERO, width, top, top + side, width, height, first, images.integrals
+            )
             if in_row < side * side:
                 continue
             for column in range(columns):
@@ -212,7 +215,7 @@ def find_blocks(
                     abstains,
                     needed,
                     tolerance_px,
-                    _MOST_CELLS,
+                    most_cells,
                 )
                 if verdict == FOUND:
                     m = matrices[camera]
@@ -271,7 +274,7 @@ def find_blocks(
                     abstains,
                     needed,
                     tolerance_px,
-                    _MOST_CELLS,
+                    most_cells,
                 )
                 is_left[denier] = True
                 if verdict == FOUND:

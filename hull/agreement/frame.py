@@ -84,6 +84,9 @@ _AS_GOOD = 0.1
 #: How far these rays are followed, in depths of the local origin.
 _REACH = 4.0
 
+#: Cells after which the search for what confirms a square of pixels is given up.
+_BLOCK_CELLS = 1000
+
 #: Cells after which a pair of suspects is let go.
 _PAIR_CELLS = 5000
 
@@ -442,6 +445,7 @@ def disputes(
         needed,
         errors,
         sides,
+        _BLOCK_CELLS,
     )
     found = []
     for camera in range(count):

@@ -40,7 +40,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.jit import compiled
+from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.silhouettes import Hull, Views
 
 #: What a search ends with: no point, proved; a point; neither within the cells allowed.
@@ -530,7 +530,7 @@ def search_cells(
                     and bottom_most >= -slack_y
                 ):
                     n_object = count_pixels(
-                        0, width, 0, height, width, height, integral_offset[other], integrals
+                        ZERO, width, ZERO, height, width, height, integral_offset[other], integrals
                     )
                     by_x, by_y, by_t = 0.0, 0.0, 0.0
                     for corner in range(8):

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.jit import compiled
+from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.silhouettes import Views
 
 #: What is told of a triangle.
@@ -185,6 +185,7 @@ def _see_triangles(
     corners = np.zeros((3 + _MORE_CORNERS * n_cameras, 3))
     other = np.zeros_like(corners)
     may_see = np.zeros(n_cameras, np.bool_)
+    three = ZERO + 3
     for number in range(len(triangles)):
         triangle = triangles[number]
         n_whole, n_may = 0, 0
@@ -205,7 +206,7 @@ def _see_triangles(
                 may_see[camera] = True
             elif not is_beside:
                 corners[:3] = triangle
-                may_see[camera] = _cut(planes[camera], corners, 3, other) > 0
+                may_see[camera] = _cut(planes[camera], corners, three, other) > 0
             if may_see[camera]:
                 n_may += 1
                 sees[camera] = True
@@ -216,7 +217,7 @@ def _see_triangles(
             continue
         if needed == n_cameras:
             corners[:3] = triangle
-            n_corners = 3
+            n_corners = three
             for camera in range(n_cameras):
                 n_corners = _cut(planes[camera], corners, n_corners, other)
                 if n_corners == 0:
@@ -224,7 +225,7 @@ def _see_triangles(
             if n_corners == 0:
                 continue
             told[number] = IN_PART
-            whole = _area(triangle, 3)
+            whole = _area(triangle, three)
             if whole > 0.0:
                 shares[number] = min(1.0, _area(corners, n_corners) / whole)
         else:
