@@ -62,3 +62,24 @@ def angle_between(first: Pose, second: Pose) -> float:
         ]
     )
     return float(np.arctan2(np.linalg.norm(axis), np.trace(relative) - 1.0))
+
+
+def nearest_to_axes(
+    centers: NDArray[np.float64], axes: NDArray[np.float64], most_condition: float
+) -> NDArray[np.float64] | None:
+    """Return the point (3,) nearest to some lines, in least squares; None if they are parallel.
+
+    Parameters
+    ----------
+    centers : (N, 3) float64
+        A point of each line.
+    axes : (N, 3) float64
+        Their directions, unit vectors; a line is the same when its direction is reversed.
+    most_condition : float
+        Lines are parallel for this purpose where the equations' condition number is not below.
+    """
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (N, 3, 3)
+    normal_matrix = across.sum(axis=0)
+    if not np.linalg.cond(normal_matrix) < most_condition:
+        return None
+    return np.asarray(np.linalg.solve(normal_matrix, np.einsum("cij,cj->i", across, centers)))

@@ -24,6 +24,7 @@ from hybridve.calib.formats.foreign import (
     principal_point_index,
     read_text,
 )
+from hybridve.calib.pose import nearest_to_axes
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 FORMAT = "hybridve-rig"
@@ -47,6 +48,9 @@ _CONVENTIONS = {
 
 #: Stands for a camera's name in the path of a rig that is one file a camera.
 PLACEHOLDER = "{camera}"
+
+#: Condition number from which on optical axes are called parallel: all within some 6 degrees.
+_PARALLEL = 100.0
 
 #: The files of a COLMAP text model that are written.
 _COLMAP_FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
@@ -204,6 +208,8 @@ def read_rig(path: Path) -> Rig:
             )
             for entry in content["cameras"]
         )
+        for camera in cameras:
+            _check_focal_lengths(camera)
         return Rig(
             cameras,
             dict(content.get("provenance", {})),
@@ -517,9 +523,11 @@ def _to_rig(
                 f"{', '.join(UNITS_M)}"
             )
         factor_m = _metres(unit, None)
+    chosen = {name: _foreign(found, name, pattern) for name in image_sizes}
+    _refuse_mirrored(found, chosen, pattern)
     cameras = []
     for name, size_px in image_sizes.items():
-        foreign = _foreign(found, name, pattern)
+        foreign = chosen[name]
         if foreign.size_px is not None:
             _check_size(foreign.size_px, size_px, name, pattern)
         params = foreign.params.copy()
@@ -530,6 +538,7 @@ def _to_rig(
         width_px, height_px = (int(extent) for extent in size_px)
         try:
             camera = Camera(name, foreign.model, width_px, height_px, params, pose, foreign.skew_px)
+            _check_focal_lengths(camera)
         except CalibrationError as error:
             raise CalibrationError(f"{pattern}: {error}") from error
         cameras.append(camera)
@@ -541,6 +550,58 @@ def _to_rig(
         "pixel_centre": pixel_centre,
     }
     return Rig(tuple(cameras), provenance)
+
+
+def _refuse_mirrored(found: ForeignRig, chosen: Mapping[str, ForeignCamera], pattern: str) -> None:
+    """Refuse mirrored pictures among cameras whose matrices have a negative determinant.
+
+    Such a matrix is a mirrored picture of what lies on one side of the camera, or with its sign
+    reversed a plain one of what lies on the other. Which it is shows where the optical axes come
+    together: they are the same lines for either.
+    """
+    poses = [camera.cam_from_world for camera in found.cameras]
+    axes = np.array([pose[2, :3] for pose in poses])
+    centers = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
+    meeting = nearest_to_axes(centers, axes, _PARALLEL)
+    if meeting is None:
+        return
+    mirrored = [
+        name
+        for name, camera in chosen.items()
+        if camera.may_be_mirrored
+        and camera.cam_from_world[2, :3] @ meeting + camera.cam_from_world[2, 3] < 0
+    ]
+    if mirrored:
+        names = ", ".join(repr(name) for name in mirrored)
+        plural = "camera" if len(mirrored) == 1 else "cameras"
+        raise CalibrationError(
+            f"{pattern}: {plural} {names}: the matrix has a negative determinant, and with its "
+            "sign reversed looks away from where all optical axes come together: it is that of a "
+            "mirrored picture (or one with y upwards); flip the pictures and the matrix's row, or "
+            "reverse the sign of its 12 numbers if the camera does look away"
+        )
+
+
+def _check_focal_lengths(camera: Camera) -> None:
+    """Refuse focal lengths that mirror a picture or turn it around.
+
+    Raises
+    ------
+    CalibrationError
+        If one is not above zero.
+    """
+    focal_px = np.diag(camera.pinhole)[:2]
+    if (focal_px > 0).all():
+        return
+    found = " and ".join(f"{value:g}" for value in focal_px)
+    if focal_px.prod() < 0:
+        why = "the picture is mirrored; flip it, and make both positive"
+    else:
+        why = (
+            "expected both above 0; where both are negative, the picture is upside down or the "
+            "camera looks the other way: turn its pose by 180 degrees"
+        )
+    raise CalibrationError(f"camera {camera.name!r}: focal lengths of {found} px: {why}")
 
 
 def _choose(rig: Rig, image_sizes: Mapping[str, tuple[int, int]], pattern: str) -> Rig:

@@ -121,8 +121,8 @@ def segment(
 
 def _cleaner(session: "Session", rig: "Rig") -> "Callable[[int, list[Mask]], list[Mask]]":
     """Return what drops the pieces of a frame's silhouettes that no other camera confirms."""
+    from hybridve.hull.agreement.pieces import drop_unconfirmed
     from hybridve.hull.capture.tracks import read_tracks
-    from hybridve.hull.consistency import drop_unconfirmed
     from hybridve.hull.evaluate import first_rig, moved_views, rig_views
 
     tracks = read_tracks(session, rig)

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.agreement.frame import disputes, judge_frame
+from hybridve.hull.agreement.sight import sight_of
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings
 from hybridve.hull.contact.clearance import ClearanceMeter
@@ -72,12 +74,16 @@ def _run_kernels() -> None:
     ClearanceMeter(*_tetrahedron(), is_closed=True).measure(hull)
     spans_in_hull(hull, np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0)
     connected_volumes(hull)
+    trio = make_hull(_views(3), [_mask()] * 3)
+    judge_frame(trio)
+    disputes(trio, 0)
+    sight_of(trio.views, mesh.vertices_world, mesh.faces)
 
 
-def _views() -> Views:
+def _views(count: int = 1) -> Views:
     matrix = np.array([[50.0, 0, 32, 32], [0, 50, 32, 32], [0, 0, 1, 1]])
-    size = np.full((1, 2), _SIDE_PX, np.int64)
-    return make_views(("camera",), size, matrix[None], "carve", 1)
+    sizes = np.full((count, 2), _SIDE_PX, np.int64)
+    return make_views(("camera",) * count, sizes, np.array([matrix] * count), "carve", 1)
 
 
 def _mask() -> NDArray[np.uint8]:

@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
 from hybridve.calib.rig import Rig
+from hybridve.hull.agreement.pieces import drop_unconfirmed
 from hybridve.hull.capture.recording import (
     FrameRange,
     recording_of,
     segmented_frames,
     undistort_mask,
 )
-from hybridve.hull.consistency import drop_unconfirmed
 from hybridve.hull.contact.detect import Contact, detect_contacts
 from hybridve.hull.evaluate import Chain, views_at
 from hybridve.hull.query.engine import Engine

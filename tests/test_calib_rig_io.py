@@ -325,6 +325,72 @@ def test_the_factor_of_a_projection_matrix_does_not_matter(
         assert_same_image(camera, taken[camera.name])  # depths in front stay positive
 
 
+def mirrored(matrix: NDArray[np.float64], width_px: int) -> NDArray[np.float64]:
+    """Return the projection of the picture flipped left to right."""
+    flip = np.array([[-1.0, 0.0, width_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(flip @ matrix)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("guilty", [["cam1"], ["cam2"], ["cam1", "cam2"]])
+def test_mirrored_pictures_are_refused_by_name(
+    tmp_path: Path, rig: Rig, guilty: list[str], sign: float
+) -> None:
+    lines = []
+    for camera in rig.cameras:
+        matrix = camera.pinhole @ camera.cam_from_world
+        if camera.name in guilty:
+            # Of a mirrored picture a reversed sign is a matrix like any other, that looks away.
+            matrix = mirrored(matrix, camera.width_px)
+        lines.append(" ".join([camera.name, *map(repr, (sign * matrix).ravel().tolist())]))
+    (tmp_path / "rig.txt").write_text("\n".join(lines))
+
+    if sign < 0:
+        taken = import_rig(tmp_path, "rig.txt", "m", 0.5, SIZES, None)
+        away = [c.name for c in taken.cameras if project_points(c, points())[1].max() < 0]
+        assert away == guilty
+        return
+    names = ", ".join(f"'{name}'" for name in guilty)
+    with pytest.raises(CalibrationError, match=f"rig.txt: cameras? {names}: .*mirrored"):
+        import_rig(tmp_path, "rig.txt", "m", 0.5, SIZES, None)
+
+
+def test_k_r_and_t_of_a_mirrored_picture_are_refused(tmp_path: Path, rig: Rig) -> None:
+    camera = rig["cam1"]
+    matrix = mirrored(camera.pinhole, camera.width_px)
+    pose = camera.cam_from_world
+    numbers = np.concatenate([matrix.ravel(), pose[:, :3].ravel(), pose[:, 3]])
+    (tmp_path / "par.txt").write_text("cam1 " + " ".join(map(repr, numbers.tolist())))
+
+    with pytest.raises(CalibrationError, match="picture of camera 'cam1' is mirrored"):
+        import_rig(tmp_path, "par.txt", "m", 0.5, {"cam1": (640, 480)}, None)
+
+
+def test_a_picture_turned_by_180_degrees_is_taken(tmp_path: Path, rig: Rig) -> None:
+    camera = rig["cam1"]
+    turned = camera.pinhole * [[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0]]
+    pose = camera.cam_from_world
+    numbers = np.concatenate([turned.ravel(), pose[:, :3].ravel(), pose[:, 3]])
+    (tmp_path / "par.txt").write_text("cam1 " + " ".join(map(repr, numbers.tolist())))
+
+    taken = import_rig(tmp_path, "par.txt", "m", 0.5, {"cam1": (640, 480)}, None)["cam1"]
+
+    pixels, depth_m = project_points(camera, points())
+    again, depth_again_m = project_points(taken, points())
+    middle = camera.pinhole[:2, 2]
+    np.testing.assert_allclose(again, 2 * middle - pixels, atol=EXACT_PX)
+    np.testing.assert_allclose(depth_again_m, depth_m, atol=EXACT_PX)
+
+
+def test_a_rig_json_whose_focal_length_mirrors_is_refused(tmp_path: Path, rig: Rig) -> None:
+    content = rig_to_dict(rig)
+    content["cameras"][1]["params"][0] *= -1.0
+    (tmp_path / "rig.json").write_text(json.dumps(content))
+
+    with pytest.raises(CalibrationError, match=r"camera 'cam2': focal lengths of .* is mirrored"):
+        read_rig(tmp_path / "rig.json")
+
+
 def test_the_placeholder_names_a_camera_whatever_the_file_says(tmp_path: Path, rig: Rig) -> None:
     for camera, line in zip(rig.cameras, rows_of(rig).splitlines(), strict=True):
         (tmp_path / camera.name).mkdir()
@@ -509,7 +575,9 @@ def test_a_fisheye_file_is_taken_as_fisheye(tmp_path: Path, rig: Rig) -> None:
         ({"T": None}, "holds no translation"),
         ({"D": np.ones((1, 14))}, "thin prism and tilt distortion"),
         ({"R": 2.0 * np.eye(3)}, "the rotation is none"),
-        ({"R": np.diag([1.0, 1.0, -1.0])}, "the rotation is none"),
+        ({"R": np.diag([1.0, 1.0, -1.0])}, "the rotation mirrors"),
+        ({"K": np.diag([-500.0, 500.0, 1.0])}, "focal lengths of -500 and 500 px: .* is mirrored"),
+        ({"K": np.diag([-500.0, -500.0, 1.0])}, "expected both above 0"),
         ({"K": np.eye(2)}, r"shape \(2, 2\)"),
     ],
 )

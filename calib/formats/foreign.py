@@ -35,6 +35,9 @@ class ForeignCamera:
         None where the file does not say.
     other_names : tuple of str
         What else the file calls it: a section, a topic.
+    may_be_mirrored : bool
+        Whether the file's matrix has a negative determinant, as that of a mirrored picture, or of
+        one whose overall sign is reversed; here it is taken for the latter.
     """
 
     name: str
@@ -44,6 +47,7 @@ class ForeignCamera:
     skew_px: float = 0.0
     size_px: tuple[int, int] | None = None
     other_names: tuple[str, ...] = ()
+    may_be_mirrored: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,7 +190,12 @@ def nearest_rotation(matrix: NDArray[np.float64], where: str) -> NDArray[np.floa
         If it is further from a rotation than that, or mirrors.
     """
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if not error < _ROUNDED_ROTATION or np.linalg.det(matrix) < 0:
+    if error < _ROUNDED_ROTATION and np.linalg.det(matrix) < 0:
+        raise CalibrationError(
+            f"{where}: the rotation mirrors (its determinant is -1): the picture is mirrored, or "
+            "an axis of the world or the camera is reversed; flip the picture, or that axis"
+        )
+    if not error < _ROUNDED_ROTATION:
         raise CalibrationError(
             f"{where}: the rotation is none (R R' is off by {error:.0e}); check the order of its "
             "entries"

@@ -81,6 +81,11 @@ def read_rows(path: Path) -> ForeignRig:
         else:
             rotation = nearest_rotation(numbers[9:18].reshape(3, 3), where)
             matrix = numbers[:9].reshape(3, 3)
+            if matrix[2, 2] > 0 and np.linalg.det(matrix) < 0:
+                raise CalibrationError(
+                    f"{where}: the picture of camera {words[0]!r} is mirrored: its K has a "
+                    "negative determinant; flip the picture, and make both focal lengths positive"
+                )
             img_from_world = matrix @ np.column_stack([rotation, numbers[18:]])
         cameras.append(_decompose(words[0], img_from_world, where))
     if not cameras:
@@ -96,7 +101,8 @@ def _decompose(name: str, img_from_world: NDArray[np.float64], where: str) -> Fo
 
     A projection matrix is known up to a factor, which may be negative. It is chosen so that
     depths are positive in front of the camera: its left part has a positive determinant if the
-    image is not mirrored.
+    image is not mirrored. Whether it is cannot be told from the matrix alone: mirrored, it would
+    look the other way, which the rig's other cameras tell (`hybridve.calib.rig_io`).
 
     References
     ----------
@@ -109,7 +115,7 @@ def _decompose(name: str, img_from_world: NDArray[np.float64], where: str) -> Fo
         raise CalibrationError(
             f"{where}: the matrix of camera {name!r} is singular; expected K [R | t]"
         )
-    sign = np.sign(determinant)
+    sign = float(np.sign(determinant))
     # RQ from QR: reverse the rows, transpose.
     flip = np.eye(3)[::-1]
     q, r = np.linalg.qr((flip @ (sign * left)).T)
@@ -127,4 +133,5 @@ def _decompose(name: str, img_from_world: NDArray[np.float64], where: str) -> Fo
         np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]),
         np.column_stack([rotation, translation]),
         skew_px,
+        may_be_mirrored=sign < 0,
     )

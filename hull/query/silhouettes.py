@@ -21,6 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.pose import nearest_to_axes
+
 Unseen = Literal["carve", "keep"]
 
 #: What a camera says at a pixel of its image. Whatever is not 0 does not deny the point.
@@ -28,6 +30,9 @@ BACKGROUND, OBJECT, UNSEEN = 0, 1, 2
 
 #: Two projections are those of one camera if a rotation leads from one to the other, to this error.
 _ROTATION_TOLERANCE = 1e-6
+
+#: Condition number from which on optical axes are parallel, for want of a better origin.
+_PARALLEL = 1e6
 
 
 #: The volume that the rows of a projection span, as a share of a box of their lengths: more than
@@ -242,12 +247,8 @@ def _origin(img_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the local origin (3,) of scaled projections (C, 3, 4), metres."""
     axes = img_from_world[:, 2, :3]
     centers = _centers(img_from_world)
-    # Least squares over the distances to the optical axes.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (C, 3, 3)
-    normal_matrix = across.sum(axis=0)
-    if np.linalg.cond(normal_matrix) < 1e6:  # beyond, the axes are parallel for this purpose
-        origin = np.linalg.solve(normal_matrix, np.einsum("cij,cj->i", across, centers))
-    else:
+    origin = nearest_to_axes(centers, axes, _PARALLEL)
+    if origin is None:
         origin = centers.mean(axis=0)
     # Centimetres: short numbers, the same on every machine.
     return np.asarray(np.round(origin, 2), np.float64)

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.boards import LENSES
-from hypothesis import given, settings
+from helpers.hulls import look_at, projection
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import N_PARAMS, Camera
+from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.foreign import rotation_vector
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import compose, rotation_about_axes
@@ -50,11 +52,19 @@ def pinholes(draw: st.DrawFn) -> Camera:
     return Camera("cam", "PINHOLE", 640, 480, params, draw(poses), skew_px)
 
 
+#: Models whose first parameter is the focal length of both axes.
+ONE_FOCAL_LENGTH = {name for name in N_PARAMS if name.startswith("SIMPLE_")} | {
+    "RADIAL",
+    "RADIAL_FISHEYE",
+}
+
+
 @st.composite
 def cameras(draw: st.DrawFn) -> Camera:
     model = draw(st.sampled_from(sorted(N_PARAMS)))
     numbers = st.floats(-1e6, 1e6, allow_subnormal=True)
     params = np.array(draw(st.lists(numbers, min_size=N_PARAMS[model], max_size=N_PARAMS[model])))
+    params[: 1 if model in ONE_FOCAL_LENGTH else 2] = draw(st.floats(1e-6, 1e6))
     name = draw(st.text(min_size=1).filter(lambda text: text.isprintable()))
     size = st.integers(1, 100_000)
     return Camera(name, model, draw(size), draw(size), params, draw(poses))
@@ -95,6 +105,52 @@ def test_a_projection_matrix_is_decomposed_without_loss(
     np.testing.assert_allclose(depth_taken_m, depth_m, atol=RELATIVE * 100)
     np.testing.assert_allclose(taken.params, camera.params, rtol=RELATIVE, atol=RELATIVE * reach_px)
     np.testing.assert_allclose(taken.skew_px, camera.skew_px, atol=RELATIVE * reach_px)
+
+
+@given(
+    parts=st.lists(
+        st.tuples(
+            st.floats(-180.0, 180.0),  # where on the ring, degrees
+            st.floats(-0.2, 0.8),  # how high, in ring radii
+            st.booleans(),  # whether the picture is mirrored
+            st.sampled_from([1.0, -1.0, 1e-3, -2e4]),  # factor of a matrix that is not
+            st.booleans(),  # whether the picture is upside down
+        ),
+        min_size=3,
+        max_size=6,
+    )
+)
+@settings(max_examples=150)
+def test_mirrored_pictures_are_refused_and_reversed_signs_are_not(
+    parts: list[tuple[float, float, bool, float, bool]],
+) -> None:
+    angles = np.deg2rad([part[0] for part in parts])
+    turn = np.abs(np.exp(2j * angles).mean())
+    assume(turn < 0.9)  # else the axes are nearly parallel, and nothing is told
+    rows, guilty = [], []
+    for number, (_, height, is_mirrored, factor, is_upside_down) in enumerate(parts):
+        angle = angles[number]
+        center = 2.0 * np.array([np.cos(angle), np.sin(angle), height])
+        pose = look_at(center, np.zeros(3), np.pi if is_upside_down else 0.0)
+        matrix = projection(pose, 600.0, 640, 480)
+        if is_mirrored:
+            matrix = np.array([[-1.0, 0, 640], [0, 1, 0], [0, 0, 1]]) @ matrix
+            guilty.append(f"'cam{number}'")
+        else:
+            matrix = factor * matrix
+        rows.append(f"cam{number} " + " ".join(repr(float(v)) for v in matrix.ravel()))
+    sizes = {f"cam{number}": (640, 480) for number in range(len(parts))}
+
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "rig.txt").write_text("\n".join(rows))
+        if guilty:
+            with pytest.raises(CalibrationError) as error:
+                import_rig(Path(folder), "rig.txt", "m", 0.5, sizes, None)
+            assert f"{', '.join(guilty)}: the matrix has a negative" in str(error.value)
+        else:
+            taken = import_rig(Path(folder), "rig.txt", "m", 0.5, sizes, None)
+            for camera in taken.cameras:
+                assert project_points(camera, np.zeros((1, 3)))[1] > 0
 
 
 @given(camera=cameras(), note=st.text(), number=st.floats(allow_nan=False, allow_infinity=False))

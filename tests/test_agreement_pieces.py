@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.lens import Undistortion
-from hybridve.hull.consistency import drop_unconfirmed, is_empty
+from hybridve.hull.agreement.pieces import drop_unconfirmed
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Views, make_hull, make_views
 
@@ -84,13 +84,3 @@ def test_the_hull_is_the_same_at_every_point(seed: int, unseen: str) -> None:
     np.testing.assert_array_equal(after, before)
     for mask, cleaned in zip(masks, result, strict=True):
         assert not (cleaned.astype(bool) & (mask == 0)).any()
-
-
-def test_a_hull_is_proved_empty_only_if_it_is() -> None:
-    apart = balls(np.array([0.6, 0.0, 0.0]))[:2] + balls(np.array([-0.6, 0.0, 0.0]))[2:]
-
-    assert is_empty(make_hull(views(), apart), 0)
-    assert not is_empty(make_hull(views(), balls(np.zeros(3))), 0)
-    assert not contains_points(
-        make_hull(views(), apart), np.random.default_rng(0).uniform(-1, 1, (50_000, 3))
-    ).any()

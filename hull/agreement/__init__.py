@@ -1,0 +1,1 @@
+"""What the cameras of a session say about each other: silhouettes and views that (dis)agree."""
