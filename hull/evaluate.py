@@ -22,6 +22,15 @@ from hybridve.calib.lens import Undistortion, undistortion
 from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig
 from hybridve.calib.rig_io import rig_to_dict
+from hybridve.hull.agreement.common_view import common_view
+from hybridve.hull.agreement.frame import (
+    DEFAULT_ERROR_PX,
+    Agreement,
+    judge_frame,
+    stated_error_px,
+)
+from hybridve.hull.agreement.search import Pencils, make_pencils
+from hybridve.hull.agreement.sight import sight_of
 from hybridve.hull.capture.recording import (
     FrameRange,
     FrameSilhouettes,
@@ -60,7 +69,7 @@ from hybridve.hull.query.silhouettes import (
     make_views,
 )
 from hybridve.hull.report.collisions import StoredMesh
-from hybridve.hull.report.schema import FrameResult, Part
+from hybridve.hull.report.schema import FrameResult, Part, State
 
 if TYPE_CHECKING:
     from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings
@@ -216,6 +225,8 @@ def make_chain(
         check_recording(session)
         check_lengths(session, settings.frames)
     views, undistortions = rig_views(session, first_rig(rig, tracks))
+    if not tracks and (seen := common_view(views)).kind == "none":
+        raise SessionError(f"{session.path}: nothing can be in the hull: {seen.reason}")
     bodies = []
     for scene_object in scene.objects:
         try:
@@ -283,19 +294,26 @@ def evaluate(
         for silhouettes in frames:
             watch = _Stopwatch(decode=silhouettes.decode_s, segment=silhouettes.segment_s)
             seen = _look(chain, tools, silhouettes, watch)
+            state: State = "unread" if seen is None else "evaluated"
+            reason = silhouettes.reason
+            if seen is not None and seen.agreement.kind == "contradiction":
+                state, reason = "contradictory", seen.agreement.reason
             if row >= skip:
-                findings = () if seen is None else _findings(chain, tools, before, seen, watch)
+                findings: tuple[Finding, ...] = ()
+                if seen is not None and state == "evaluated":
+                    findings = _findings(chain, tools, before, seen, watch)
                 watch.stage_s["write"] = write_s()
                 yield FrameResult(
                     index=silhouettes.index,
                     time_s=silhouettes.index / chain.session.fps,
-                    reason=silhouettes.reason,
+                    reason=reason,
                     findings=findings,
                     stage_s=watch.stage_s,
-                    state="unread" if silhouettes.reason else "evaluated",
-                    object_share=() if seen is None else object_share(seen.hull),
+                    state=state,
+                    rests_on="" if seen is None else seen.agreement.reason,
+                    object_share=() if seen is None else tuple(seen.hull.object_shares().tolist()),
                 )
-            before = seen
+            before = seen if state == "evaluated" else None
             row += 1
     if row == 0:
         raise SessionError(
@@ -326,6 +344,9 @@ class _Tools:
     certifier: Certifier | None
     meters: list[ClearanceMeter]
     doubter: "Doubter | None"
+    error_px: NDArray[np.int64]
+    pencils: Pencils | None
+    share_seen: list[float]
 
     @classmethod
     @contextmanager
@@ -344,6 +365,7 @@ class _Tools:
                 for part in chain.scene.objects
             ]
         doubter = None
+        error_px = np.full(len(chain.views), DEFAULT_ERROR_PX)
         if "doubt" in computed_parts(settings):
             # Late: it brings scipy's optimisers, for which a picture or a sweep need not wait.
             from hybridve.hull.contact.uncertainty import Doubter, outline_errors
@@ -357,8 +379,12 @@ class _Tools:
                 chain.rig,
             )
             doubter = Doubter(errors, settings.doubt)
+            error_px = stated_error_px(errors.sigma_px)
+        is_still = not chain.tracks
+        pencils = make_pencils(chain.views) if is_still else None
+        shares = _shares_seen(chain, chain.views) if is_still else []
         with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:
-            yield cls(engine, certifier, meters, doubter)
+            yield cls(engine, certifier, meters, doubter, error_px, pencils, shares)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -368,8 +394,19 @@ class _Seen:
     index: int
     time_s: float
     hull: Hull
+    agreement: Agreement
     contacts: list[Contact]
     clearances: list[Clearance]
+
+
+def _shares_seen(chain: Chain, views: Views) -> list[float]:
+    """Return the share of each object's surface that enough cameras see; 0 if that is proved."""
+    shares = []
+    for part in chain.scene.objects:
+        sight = sight_of(views, part.vertices_world, part.faces)
+        least = 0.0 if sight.is_not_seen else float(np.finfo(np.float64).tiny)
+        shares.append(1.0 if sight.is_seen else max(sight.share, least))
+    return shares
 
 
 def _look(
@@ -379,6 +416,11 @@ def _look(
     if silhouettes.masks is None:
         return None
     hull = make_hull(views_at(chain, silhouettes.index), silhouettes.masks)
+    time_s = silhouettes.index / chain.session.fps
+    agreement = judge_frame(hull, tools.error_px, tools.pencils)
+    if agreement.kind == "contradiction":
+        watch.lap("query")
+        return _Seen(silhouettes.index, time_s, hull, agreement, [], [])
     contacts = detect_contacts(hull, chain.bodies, tools.engine)
     watch.lap("query")
     if tools.certifier is not None:
@@ -396,8 +438,7 @@ def _look(
             for (_, clearance), part in zip(pairs, chain.scene.objects, strict=True)
         ]
     watch.lap("clearance")
-    time_s = silhouettes.index / chain.session.fps
-    return _Seen(silhouettes.index, time_s, hull, contacts, clearances)
+    return _Seen(silhouettes.index, time_s, hull, agreement, contacts, clearances)
 
 
 def _findings(
@@ -413,9 +454,10 @@ def _findings(
             finding = replace(finding, response=_response(chain, number, seen.hull, finding))
         findings.append(finding)
     watch.lap("respond")
+    shares = tools.share_seen or _shares_seen(chain, seen.hull.views)
     findings = [
-        _completed(chain, tools, number, seen.hull, finding)
-        for number, finding in enumerate(findings)
+        _completed(chain, tools, seen, number, finding, share)
+        for number, (finding, share) in enumerate(zip(findings, shares, strict=True))
     ]
     watch.lap("patches")
     if tools.doubter is not None:
@@ -468,16 +510,19 @@ def _compared(
     )
 
 
-def _completed(chain: Chain, tools: _Tools, number: int, hull: Hull, finding: Finding) -> Finding:
+def _completed(
+    chain: Chain, tools: _Tools, seen: _Seen, number: int, finding: Finding, share_seen: float
+) -> Finding:
     """Return a finding with its verdict, its patches, and what moving the whole object does."""
-    part = chain.scene.objects[number]
+    part, hull = chain.scene.objects[number], seen.hull
     required_m = part.required_clearance_m
     finding = judged(
         finding,
         is_closed=part.is_closed,
         required_m=required_m,
-        share_seen=np.nan,
-        rests_on="",
+        share_seen=share_seen,
+        rests_on=seen.agreement.reason,
+        is_sound=seen.agreement.is_sound or seen.agreement.kind == "silent",
     )
     if finding.clearance is None:
         return finding
@@ -497,14 +542,6 @@ def _completed(chain: Chain, tools: _Tools, number: int, hull: Hull, finding: Fi
         recovery = recover(hull, meter, response.v_rec, response.d_rec_m, reach_m)
         finding = replace(finding, recovery=recovery)
     return finding
-
-
-def object_share(hull: Hull) -> tuple[float, ...]:
-    """Return the share of each camera's picture that is object."""
-    return tuple(
-        float(hull.integral(camera)[-1, -1]) / float(np.prod(size))
-        for camera, size in enumerate(hull.views.sizes_px)
-    )
 
 
 def _response(chain: Chain, number: int, hull: Hull, finding: Finding) -> Response:

@@ -60,7 +60,7 @@ from hybridve.hull.agreement.search import (
     search,
     search_hull,
 )
-from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.query.silhouettes import Hull, Views, hull_of
 from hybridve.hull.query.walk import spans_of_rays
 
 Kind = Literal["agreed", "nobody", "silent", "within error", "elsewhere", "contradiction", "open"]
@@ -346,19 +346,7 @@ def _explained(hull: Hull, pencils: Pencils, group: tuple[int, ...]) -> float:
     if len(rest) < 2:
         return 1.0
     views = hull.views
-    alone = Hull(
-        replace(
-            views,
-            names=_names(views, rest),
-            sizes_px=views.sizes_px[rest],
-            img_from_local=views.img_from_local[rest],
-            min_cameras=min(views.min_cameras, len(rest)),
-        ),
-        hull.masks_flat,
-        hull.mask_offset[rest],
-        hull.integrals_flat,
-        hull.integral_offset[rest],
-    )
+    alone = hull_of(hull, np.array(rest))
     n_rays, n_met = 0, 0
     for camera in rest:
         pixels = object_pixels(hull, camera, _EXPLAINED_RAYS)

@@ -22,8 +22,8 @@ What a rectangle proves
 As in `hybridve.hull.query.bounds`: the rectangle, grown by the camera's tolerance, that holds no
 object pixel proves that B sees none at any point of the cell, though silhouettes were grown by
 that: four look-ups, and no grown silhouette is ever made. A camera that *abstains* where it does
-not see proves it only where the grown rectangle lies wholly in its image. Besides, so many cameras
-as are `needed` must be able to see an object pixel.
+not see proves it only where the grown rectangle lies wholly in what it recorded. Besides, so many
+cameras as are `needed` must be able to see an object pixel.
 
 Rounding: u and v are counted in image widths from the image's middle, so that the matrix inverted
 is well conditioned (a condition number kappa of some 10). H, e and h are then off by at most
@@ -110,6 +110,7 @@ class Images(NamedTuple):
 
     integrals: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
+    recorded_offset: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,7 +209,7 @@ def make_pencils(views: Views) -> Pencils:
 
 def images_of(hull: Hull) -> Images:
     """Return the silhouettes of a frame as compiled loops take them."""
-    return Images(hull.integrals_flat, hull.integral_offset)
+    return Images(hull.integrals_flat, hull.integral_offset, hull.recorded_offset)
 
 
 def bounding_box(hull: Hull, camera: int, grown_px: int = 0) -> tuple[float, float, float, float]:
@@ -317,6 +318,29 @@ def count_pixels(
 
 
 @compiled
+def is_wholly_recorded(
+    x0: int,
+    x1: int,
+    y0: int,
+    y1: int,
+    width: int,
+    height: int,
+    first: int,
+    integrals: NDArray[np.int32],
+) -> bool:
+    """Tell whether columns x0..x1 - 1 and rows y0..y1 - 1 are in an image, which recorded them all.
+
+    The integral image of what it recorded begins at `first`, which is below 0 if that is all.
+    """
+    if x0 < 0 or y0 < 0 or x1 > width or y1 > height:
+        return False
+    if first < 0:
+        return True
+    n_recorded = count_pixels(x0, x1, y0, y1, width, height, first, integrals)
+    return n_recorded == (x1 - x0) * (y1 - y0)
+
+
+@compiled
 def counts(
     x: float,
     y: float,
@@ -362,13 +386,16 @@ def counts(
                 if n_object > 0:
                     n_seen += 1
                     continue
-                is_wholly_seen = (
-                    column >= grown
-                    and row >= grown
-                    and column + grown < width
-                    and row + grown < height
-                )
-                if is_wholly_seen:
+                if is_wholly_recorded(
+                    column - grown,
+                    column + grown + 1,
+                    row - grown,
+                    row + grown + 1,
+                    width,
+                    height,
+                    images.recorded_offset[camera],
+                    integrals,
+                ):
                     return False
         if not abstains[camera]:
             return False
@@ -485,7 +512,9 @@ def search_cells(
                 y0 = int(np.floor(min(max(y_min - pad_px_y, -border), height + border))) - grown
                 y1 = int(np.floor(min(max(y_max + pad_px_y, -border), height + border))) + grown + 1
                 if x1 > 0 and y1 > 0 and x0 < width and y0 < height:
-                    is_wholly_seen = x0 >= 0 and y0 >= 0 and x1 <= width and y1 <= height
+                    is_wholly_seen = is_wholly_recorded(
+                        x0, x1, y0, y1, width, height, images.recorded_offset[other], integrals
+                    )
                     n_object = count_pixels(
                         x0, x1, y0, y1, width, height, integral_offset[other], integrals
                     )

@@ -15,9 +15,10 @@ def points_count(hull: Hull, points_world: NDArray[np.float64], rule: Rule) -> N
     """Tell which points count by a rule.
 
     A camera that is asked sees a point on an object pixel of its grown silhouette, which may reach
-    beyond its image; or on background, where the true pixel is background within its image however
-    the outline is off; or not at all, which rules the point out unless the camera abstains. A point
-    counts that no camera rules out and as many as are needed see on an object pixel.
+    beyond its image; or on background, where the true pixel is background that was recorded within
+    its image however the outline is off; or not at all, which rules the point out unless the camera
+    abstains. A point counts that no camera rules out and as many as are needed see on an object
+    pixel.
 
     Parameters
     ----------
@@ -54,6 +55,14 @@ def points_count(hull: Hull, points_world: NDArray[np.float64], rule: Rule) -> N
         on_object = is_near & (grown[row + border, column + border] > 0)
         is_certain = is_near & (column >= grown_px) & (row >= grown_px)
         is_certain &= (column + grown_px < width) & (row + grown_px < height)
+        recorded = views.seen_mask(camera)
+        if recorded is not None:
+            gaps = cv2.dilate(
+                (recorded == 0).astype(np.uint8),
+                np.ones((2 * grown_px + 1, 2 * grown_px + 1), np.uint8),
+            )
+            inside = is_certain.copy()
+            is_certain[inside] &= gaps[row[inside], column[inside]] == 0
         n_seen += on_object
         is_out |= ~on_object & (is_certain | ~rule.abstains[camera])
     return np.asarray(~is_out & (n_seen >= rule.needed))

@@ -80,7 +80,13 @@ class Finding:
 
 
 def judged(
-    finding: Finding, *, is_closed: bool, required_m: float, share_seen: float, rests_on: str
+    finding: Finding,
+    *,
+    is_closed: bool,
+    required_m: float,
+    share_seen: float,
+    rests_on: str,
+    is_sound: bool = True,
 ) -> Finding:
     """Return a finding with its verdict; see `hybridve.hull.contact.verdict.Facts`."""
     clearance = finding.clearance
@@ -95,6 +101,7 @@ def judged(
             required_m,
             share_seen,
             rests_on,
+            is_sound,
         )
     )
     return replace(finding, verdict=verdict, reason=reason)

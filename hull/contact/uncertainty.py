@@ -548,23 +548,7 @@ def without_camera(hull: Hull, camera: int) -> Hull:
     views = hull.views
     if len(views) < 2:
         raise ValueError("there is one camera; without it there is no hull")
-    rest = np.delete(np.arange(len(views)), camera)
-    fewer = Views(
-        tuple(views.names[k] for k in rest),
-        views.sizes_px[rest],
-        views.img_from_local[rest],
-        views.origin_world,
-        views.unseen,
-        min(views.min_cameras, len(rest)),
-        None if views.seen is None else views.seen.of(rest),
-    )
-    return replace(
-        hull,
-        views=fewer,
-        mask_offset=hull.mask_offset[rest],
-        integral_offset=hull.integral_offset[rest],
-        recorded_offset=hull.recorded_offset[rest],
-    )
+    return hull_of(hull, np.delete(np.arange(len(views)), camera))
 
 
 def outline_sensitivity(

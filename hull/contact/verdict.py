@@ -42,6 +42,9 @@ class Facts:
         as many as must see a point. 0 only if no point of it does; NaN where nobody asked.
     rests_on : str
         What an empty hull rests on, in words; empty if it is not empty.
+    is_sound : bool
+        Whether such a hull may be believed: not if silhouettes miss each other, be it by less than
+        they err.
     """
 
     touches: bool
@@ -53,6 +56,7 @@ class Facts:
     required_m: float = 0.0
     share_seen: float = math.nan
     rests_on: str = ""
+    is_sound: bool = True
 
 
 def judge(facts: Facts) -> tuple[Verdict, str]:
@@ -76,6 +80,8 @@ def judge(facts: Facts) -> tuple[Verdict, str]:
         return "too near", f"at most {_mm(upper_m)} mm away, {required}"
     if facts.share_seen == 0.0:
         return "not seen", "outside what the cameras can tell: no point of it can be in the hull"
+    if not facts.is_sound:
+        return "open", facts.rests_on
     if lower_m < facts.required_m:
         return "open", f"between {_mm(lower_m)} and {_mm(upper_m)} mm away, {required}"
     if math.isnan(lower_m) and facts.required_m > 0:

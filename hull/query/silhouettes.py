@@ -442,3 +442,33 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
                 np.add(target, np.uint8(UNSEEN) * (np.uint8(1) - seen), out=answers)
         cv2.integral(target, sum=hull.integral(camera), sdepth=cv2.CV_32S)
     return hull
+
+
+def hull_of(hull: Hull, cameras: NDArray[np.int64]) -> Hull:
+    """Return the hull of some of the cameras; images are shared, not copied.
+
+    Where ``min_cameras`` asks for more than these, it asks for all of them.
+
+    Parameters
+    ----------
+    hull : Hull
+        Of all cameras.
+    cameras : (K,) int64
+        Numbers of those that are left, at least one.
+    """
+    views = hull.views
+    fewer = replace(
+        views,
+        names=tuple(views.names[camera] for camera in cameras),
+        sizes_px=views.sizes_px[cameras],
+        img_from_local=views.img_from_local[cameras],
+        min_cameras=min(views.min_cameras, len(cameras)),
+        seen=None if views.seen is None else views.seen.of(cameras),
+    )
+    return replace(
+        hull,
+        views=fewer,
+        mask_offset=hull.mask_offset[cameras],
+        integral_offset=hull.integral_offset[cameras],
+        recorded_offset=hull.recorded_offset[cameras],
+    )

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from helpers.agreement import balls, random_views, shifted
+from helpers.hulls import with_gaps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -78,7 +79,8 @@ def test_what_is_proved_empty_holds_no_point_and_what_is_found_is_one(
     seed: int, n_cameras: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    hull = random_hull(rng, random_views(rng, n_cameras, spread_m=0.5))
+    views = random_views(rng, n_cameras, "keep", spread_m=0.5)
+    hull = random_hull(rng, with_gaps(rng, views) if rng.random() < 0.5 else views)
     rule = random_rule(rng, n_cameras)
     camera = int(rng.choice(np.flatnonzero(rule.is_asked)))
 
@@ -99,7 +101,7 @@ def test_what_is_proved_empty_holds_no_point_and_what_is_found_is_one(
 @given(
     seed=seeds,
     n_cameras=st.integers(1, 5),
-    unseen=st.sampled_from(["carve", "keep"]),
+    unseen=st.sampled_from(["carve", "keep", "gaps"]),
     data=st.data(),
 )
 @settings(max_examples=100)
@@ -108,10 +110,10 @@ def test_a_hull_is_proved_empty_only_if_it_is(
 ) -> None:
     rng = np.random.default_rng(seed)
     min_cameras = data.draw(st.integers(1, n_cameras))
-    views = random_views(rng, n_cameras, unseen, min_cameras, 0.5)  # type: ignore[arg-type]
-    hull = random_hull(rng, views)
+    views = random_views(rng, n_cameras, "carve" if unseen == "carve" else "keep", min_cameras, 0.5)
+    hull = random_hull(rng, with_gaps(rng, views) if unseen == "gaps" else views)
 
-    found = search_hull(hull, make_pencils(views), Rule.of(views), 20_000)
+    found = search_hull(hull, make_pencils(hull.views), Rule.of(views), 20_000)
 
     points = np.concatenate(
         [rng.uniform(-1.0, 1.0, (5000, 3)), rng.uniform(-5.0, 5.0, (2000, 3))]
