@@ -370,7 +370,7 @@ def test_summary_counts_what_the_report_holds(
     assert run("summary", path) == 0
     text = capsys.readouterr().out
     assert "hit" in text
-    assert "colliding" in text
+    assert "1 clash, 1 kept" in text
 
 
 def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(

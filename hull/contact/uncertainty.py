@@ -84,7 +84,7 @@ from hybridve.hull.contact.components import (
 )
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import BACKGROUND, UNSEEN, Hull, Views
+from hybridve.hull.query.silhouettes import BACKGROUND, UNSEEN, Hull, Views, hull_of
 from hybridve.hull.query.walk import silhouette_normal
 
 #: One-sided 95 % of a normal distribution, in standard deviations.

@@ -143,6 +143,8 @@ def _about_touching(
     proved_free = (rows.certificate == "free") & ~rows.is_inside
     has_witness = rows.certificate == "colliding"
     is_open = rows.certificate == "open"
+    # Something was seen, and no hull came of it: a contact may go on.
+    is_doubtful = (report.rests_on != "") & (rows.verdict == "open")
     offset = rows.patches.get("offset", np.zeros(1, np.uint64))
     return {
         "frames_colliding": int(rows.touches.sum()),
@@ -164,7 +166,7 @@ def _about_touching(
                 "stop_s": float(report.time_s[last]),
                 **{name: _plain(rows[name][first]) for name in _ENTRY if name in rows},
             }
-            for first, last in spans(rows.clashes, ~is_valid)
+            for first, last in spans(rows.clashes, ~is_valid | is_doubtful)
         ],
     }
 
