@@ -321,7 +321,7 @@ def closest_on_surface(
         # Points come in order: the triangle of the last one is a good first guess.
         squared, best_x, best_y = _squared_to_triangle(p_x, p_y, p_z, frame, best)
         reach = _reach(squared, longest_m)
-        waiting[0], waiting_squared[0] = 0, _squared_to_box(p_x, p_y, p_z, box, 0)
+        waiting[0], waiting_squared[0] = 0, _squared_to_box(p_x, p_y, p_z, box, ZERO)
         n_waiting = 1
         while n_waiting > 0:
             n_waiting -= 1
