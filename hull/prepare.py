@@ -18,6 +18,8 @@ from hybridve.hull.capture.segment import Segmenter, SegmentSettings
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import connected_volumes
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
+from hybridve.hull.contact.patches import contact_patches
+from hybridve.hull.contact.respond import collision_point
 from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.jit import FOLDER
 from hybridve.hull.query.certify import Certifier
@@ -65,12 +67,16 @@ def _run_kernels() -> None:
     with Native(1) as engine, Certifier(0.1, 1) as certifier:
         for _ in range(2):  # clusters are made for the second frame
             hull = make_hull(views, [_mask()])
-            detect_contacts(hull, [sheet], engine)
+            (contact,) = detect_contacts(hull, [sheet], engine)
             certifier.certify_mesh(hull, sheet.triangles)
     mesh = sheet.triangles
     meter = ClearanceMeter(mesh.vertices_world, mesh.faces, is_closed=False)
     for shift_world in (np.zeros(3), np.array([3.0, 0.0, 1.0])):  # touched, and far beside
         meter.measure(hull, shift_world)
+    nowhere = np.zeros(3)
+    contact_patches(hull, meter, contact, required_m=0.0, reference_point_world=nowhere)
+    collision_point(contact, nowhere)
+    contact.points()
     ClearanceMeter(*_tetrahedron(), is_closed=True).measure(hull)
     spans_in_hull(hull, np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0)
     connected_volumes(hull)

@@ -34,7 +34,9 @@ def sessions(tmp_path: Path) -> list[Path]:
 @pytest.fixture
 def layouts(tmp_path: Path) -> list[Path]:
     near = write_cube_scene(tmp_path / "near", {"cube": (0.0, 0.0, 0.0)})
-    far = write_cube_scene(tmp_path / "far", {"cube": (900.0, 0.0, 0.0), "other": (0.0, 0.0, 5e3)})
+    far = write_cube_scene(
+        tmp_path / "far", {"cube": (900.0, 0.0, 0.0), "other": (0.0, 0.0, 700.0)}
+    )
     text = near.read_text(encoding="utf-8") + "required_clearance_mm = 1000\n"
     near.write_text(text, encoding="utf-8")
     return [near, far]

@@ -382,4 +382,4 @@ def test_a_second_detect_does_without_the_readers(folder: Path, tmp_path: Path) 
     ]
 
     assert shown[0][2:-1] == shown[1][2:-1]
-    assert "colliding" in shown[0][2]
+    assert "1 clash" in shown[0][0]

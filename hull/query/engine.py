@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.viewport import MAX_VIEWPORT, expand_runs, run_ends, samples_before
+from hybridve.hull.query.viewport import (
+    MAX_VIEWPORT,
+    expand_runs,
+    read_only,
+    run_ends,
+    samples_before,
+)
 
 #: The largest coordinate of a vertex, metres. Squares of what is projected must not overflow in
 #: single precision, in which graphics hardware computes; nobody's CAD is a hundred light years.
@@ -267,7 +273,8 @@ class Hits:
     def ends(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return triangle and sample of those among which is the farthest from any point."""
         topology = self.topology
-        return self.at(run_ends(self.start, self.stop, topology.samples_before, topology.viewports))
+        given = (self.start, self.stop, topology.samples_before, topology.viewports)
+        return self.at(run_ends(*map(read_only, given)))
 
 
 class Closing:

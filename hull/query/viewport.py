@@ -14,6 +14,8 @@ Samples are numbered row by row, j = 0 first: sample (i, j) is number ``j u - j 
 An engine returns numbers; positions come from here alone.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -188,8 +190,16 @@ def place_runs(
     """
     count = int((stop - start).sum())
     triangle, positions = np.zeros(count, np.uint32), np.zeros((count, 3))
-    _place_runs(start, stop, before, vertices, faces, viewports, triangle, positions)
+    given = (start, stop, before, vertices, faces, viewports)
+    _place_runs(*map(read_only, given), triangle, positions)
     return triangle, positions
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a view that cannot be written to, which is a type to the compiler; one is enough."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 @compiled

@@ -506,7 +506,7 @@ def _walk(
                         seen_m[camera, 1],
                         answers[first : first + width * height],
                         width,
-                        UNSEEN,
+                        ZERO + UNSEEN,
                         recorded_m[n_recorded:],
                         ZERO,
                     )
@@ -533,7 +533,7 @@ def _walk(
                         min(to_m, last_m),
                         image,
                         width,
-                        BACKGROUND,
+                        ZERO + BACKGROUND,
                         then_m,
                         n_then,
                     )
