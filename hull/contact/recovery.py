@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.query.silhouettes import Hull
 
-#: The first step beyond D_rec, metres; each next one is twice as long.
-_STEP_M = 1e-3
+#: The first step beyond D_rec, as a share of it, and metres at least; each next one is twice as long.
+_STEP, _LEAST_STEP_M = 1.0 / 4.0, 1e-3
 
 #: Halvings between a shift that is not certain to free and one that does, until they are this share
 #: of the latter apart.
@@ -78,7 +78,7 @@ def recover(
     answer = frees(first_m)
     if answer == "yes":
         return Recovery(answer, d_rec_m, first_m)
-    blocked_m, free_m, step_m = first_m, np.inf, _STEP_M
+    blocked_m, free_m, step_m = first_m, np.inf, max(_STEP * d_rec_m, _LEAST_STEP_M)
     while blocked_m < reach_m:
         shift_m = min(blocked_m + step_m, reach_m)
         if frees(shift_m) == "yes":
