@@ -308,7 +308,7 @@ class Doubter:
     """
 
     def __init__(self, errors: OutlineErrors, settings: DoubtSettings | None = None) -> None:
-        self._errors = errors
+        self.errors = errors
         self._settings = settings or DoubtSettings()
 
     def frame(
@@ -323,7 +323,7 @@ class Doubter:
         tracking_from_tracker : mapping of str to (3, 4) float64, optional
             Where the trackers of moving cameras were.
         """
-        errors = self._errors
+        errors = self.errors
         if errors.rig is not None and tracking_from_tracker:
             errors = replace(errors, rig=errors.rig.at(tracking_from_tracker))
         return FrameDoubts(hull, errors, self._settings)
@@ -377,13 +377,7 @@ class FrameDoubts:
         required_m : float
             The clearance that the object requires.
         """
-        sensitivity_m, is_remeasured, normals_px = self.sensitivity(meter, clearance)
-        variance_m2 = float(((sensitivity_m * self.errors.sigma_px) ** 2).sum())
-        if np.isfinite(variance_m2):
-            variance_m2 += self.errors.calibration_variance_m2(
-                clearance.on_hull_world, sensitivity_m, normals_px
-            )
-        std_m = float(np.sqrt(variance_m2))
+        std_m, sensitivity_m, is_remeasured = self.deviation(meter, clearance)
         touching_world = _touching_points(contact)
         points_world = touching_world
         if len(points_world) == 0 and np.isfinite(clearance.on_hull_world).all():
@@ -417,12 +411,50 @@ class FrameDoubts:
             component=self._component(points_world),
         )
 
+    def deviation(
+        self,
+        meter: ClearanceMeter,
+        clearance: Clearance,
+        shift_world: NDArray[np.float64] | None = None,
+    ) -> tuple[float, NDArray[np.float64], bool]:
+        """Return the standard deviation of a clearance, metres, and what it comes from.
+
+        Parameters
+        ----------
+        meter : ClearanceMeter
+            Of the object.
+        clearance : Clearance
+            What it measured in this frame.
+        shift_world : (3,) float64, optional
+            Where it measured: by how much the object was moved, metres.
+
+        Returns
+        -------
+        std_m : float
+            NaN where no clearance is known, or there is no direction from the hull to the surface.
+        sensitivity_m : (C,) float64
+            Metres per pixel of each camera's outline.
+        is_remeasured : bool
+            Whether these were found by measuring anew.
+        """
+        sensitivity_m, is_remeasured, normals_px = self.sensitivity(meter, clearance, shift_world)
+        variance_m2 = float(((sensitivity_m * self.errors.sigma_px) ** 2).sum())
+        if np.isfinite(variance_m2):
+            variance_m2 += self.errors.calibration_variance_m2(
+                clearance.on_hull_world, sensitivity_m, normals_px
+            )
+        return float(np.sqrt(variance_m2)), sensitivity_m, is_remeasured
+
     def sensitivity(
-        self, meter: ClearanceMeter, clearance: Clearance
+        self,
+        meter: ClearanceMeter,
+        clearance: Clearance,
+        shift_world: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], bool, NDArray[np.float64]]:
         """Return metres per pixel (C,), whether they were measured anew, and outlines' normals.
 
-        The normals (C, 2) are unit vectors in the images, NaN where not known.
+        The normals (C, 2) are unit vectors in the images, NaN where not known. The object was
+        measured in its place, or moved by `shift_world` (3,), metres.
         """
         n_cameras = len(self.hull.views)
         unknown = np.full((n_cameras, 2), np.nan)
@@ -445,7 +477,7 @@ class FrameDoubts:
             return sensitivity_m, False, normals_px
         for camera in range(n_cameras):
             if _is_near_background(self.hull, camera, clearance.on_hull_world):
-                then = meter.measure(self._grown_in(camera))
+                then = meter.measure(self._grown_in(camera), shift_world)
                 sensitivity_m[camera] = max(0.0, clearance.signed_m[1] - then.signed_m[1])
         return sensitivity_m, True, unknown
 
