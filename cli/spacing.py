@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -203,6 +204,7 @@ def spacing(
             "stop_m": move.stop_m,
             "tolerance_m": move.tolerance_m,
             "grow_px": grow_px,
+            "doubt": None if settings.doubt is None else asdict(settings.doubt),
             "frames": str(frames),
         },
         sessions=tuple(found),
