@@ -5,9 +5,10 @@ Two kinds of task:
 * balls before a wall in closed form (`helpers.erring_task`), where one frame decides, or several
   need the same room;
 * recordings of the preset "payload", generated and calibrated: in every repeat the cameras are
-  believed to stand where the rig's own covariance lets them, one draw for all frames, and all
-  outlines are those of the true shapes, moved outward or inward by a normal error, smooth along
-  the outline, another one for each camera and frame. Nothing is rendered.
+  believed to stand where the rig's own covariance lets them, one draw for all frames, their pixels
+  lie a part of a pixel beside where they did, and all outlines are those of the true shapes, moved
+  outward or inward by a normal error, smooth along the outline, another one for each camera and
+  frame. No picture is rendered.
 
 Told are the share of repeats in which the truth is not above the shift at 95 %, and above the shift
 that is found without it; the error's mean and standard deviation; and the deviation stated.
@@ -31,12 +32,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from helpers.erring_task import erring_task
 
 from hybridve.calib.bundle import moved_pose
+from hybridve.calib.camera import Camera
+from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig
 from hybridve.calib.uncertainty import parameter_slices
 from hybridve.hull.capture.recording import undistort_mask
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.session import Session, load_session
-from hybridve.hull.capture.synth.truth import SpacingTruth, read_truth, true_masks
+from hybridve.hull.capture.synth.render import make_view, true_silhouette
+from hybridve.hull.capture.synth.truth import SpacingTruth, read_truth
 from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.contact.spacing import Move, blocked_shifts, free_of, union
 from hybridve.hull.contact.spacing_doubt import unsure_shifts
@@ -46,13 +50,13 @@ from hybridve.hull.query.silhouettes import make_hull
 from hybridve.hull.spacing import Layout
 
 #: Frames that need less room than the recording by more than this decide nothing, metres.
-_NEAR_M = 0.025
+_NEAR_M = 0.012
 
 #: The error of an outline is alike over so many pixels.
 _SMOOTH_PX = 40
 
-#: Outlines are found anew on a grid so many times finer.
-_FINER = 4
+#: The true outlines are found on a grid so many times finer.
+_FINER = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,29 +112,45 @@ class Payload:
         self._calibrated = load_rig(self._session)
         truth = read_truth(folder)
         by_name = {camera.name: camera for camera in truth.cameras}
-        self._true = by_name
+        self._true = [by_name[camera.name] for camera in self._session.cameras]
         self.truth: SpacingTruth = truth.spacing["payload_a"]
         self._settings, self._rng = DoubtSettings(segmentation_px=mask_std_px), rng
         move = Move(np.asarray(self.truth.along), -0.05, 0.15, 1e-3)
         self._layout = Layout.of(load_scene(folder / "scene.toml"), ["payload_a"], move)
         needed_m = self.truth.needed_hull_by_frame_m
         self.frames = np.flatnonzero(needed_m > needed_m.max() - _NEAR_M).tolist()
+        views = [make_view(_finer(camera)) for camera in self._true]
+        shapes = list(truth.shapes.values())
         self._inside_px = [
-            [_inside_px(masks[camera.name]) for camera in self._session.cameras]
-            for masks in (true_masks(folder, frame) for frame in self.frames)
+            [
+                _inside_px(
+                    true_silhouette(
+                        view, shapes, [truth.world_from_shape[name][frame] for name in truth.shapes]
+                    )
+                )
+                for view in views
+            ]
+            for frame in self.frames
         ]
 
     def repeat(self, tally: Tally) -> None:
-        """See the recording once more."""
-        rig, move = self._believed(), self._layout.move
+        """See the recording once more, with pixels that lie otherwise."""
+        beside_px = self._rng.uniform(-0.5, 0.5, (len(self._true), 2))
+        true = [
+            replace(camera, params=camera.params + np.pad([0.0, 0.0, *by], (0, 4)))
+            for camera, by in zip(self._true, beside_px, strict=True)
+        ]
+        rig, move = self._believed(true), self._layout.move
         views, lenses = rig_views(self._session, rig)
-        errors = outline_errors(views.names, {}, [0.0] * len(views), self._settings, rig)
-        doubter = Doubter(errors, self._settings)
+        shift_px = [lens_shift_px(*pair) for pair in zip(rig.cameras, lenses, strict=True)]
+        doubter = Doubter(
+            outline_errors(views.names, {}, shift_px, self._settings, rig), self._settings
+        )
         blocked, unsure, std_m = [], [], []
         for inside_px in self._inside_px:
             masks = [
-                undistort_mask((one > self._error_px(one.shape)).astype(np.uint8), lens)
-                for one, lens in zip(inside_px, lenses, strict=True)
+                undistort_mask(self._mask(*seen), lens)
+                for *seen, lens in zip(inside_px, true, beside_px, lenses, strict=True)
             ]
             hull = make_hull(views, masks)
             mine = blocked_shifts(hull, self._layout.moved, move)
@@ -143,48 +163,62 @@ class Payload:
             kept.append(float(free_m[0, 0]) if len(free_m) else np.nan)
         tally.std_m.append(std_m[int(np.argmax([one[:, 1].max(initial=-1.0) for one in unsure]))])
 
-    def _believed(self) -> Rig:
+    def _believed(self, true: list[Camera]) -> Rig:
         """Return a rig that is as far from the truth as the calibrated one says that it may be."""
-        covariance = self._calibrated.covariance
+        calibrated = self._calibrated.only([camera.name for camera in true])
+        covariance = calibrated.covariance
         assert covariance is not None
         error = self._rng.multivariate_normal(
             np.zeros(len(covariance.labels)), covariance.matrix, method="eigh"
         )
-        cameras = []
-        calibrated = self._calibrated.cameras
-        for camera, part in zip(calibrated, parameter_slices(calibrated), strict=True):
-            true = self._true[camera.name]
-            change = error[part]
-            cameras.append(
-                replace(
-                    true,
-                    cam_from_world=moved_pose(true.cam_from_world, change[:6]),
-                    params=true.params + change[6:],
-                )
+        cameras = [
+            replace(
+                camera,
+                cam_from_world=moved_pose(camera.cam_from_world, error[part][:6]),
+                params=camera.params + error[part][6:],
             )
+            for camera, part in zip(true, parameter_slices(calibrated.cameras), strict=True)
+        ]
         return Rig(tuple(cameras), covariance=covariance)
 
-    def _error_px(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Return by how much an outline lies farther in, all over an image: smooth and normal."""
-        height, width = shape
-        coarse = self._rng.normal(size=(height // _SMOOTH_PX + 4, width // _SMOOTH_PX + 4))
-        field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-        # Between its nodes an interpolated field varies less than at them.
-        return np.asarray(
-            self._settings.segmentation_px * field / float(np.sqrt(np.mean(field**2))), np.float32
+    def _mask(
+        self, inside_px: NDArray[np.float32], camera: Camera, beside_px: NDArray[np.float64]
+    ) -> NDArray[np.uint8]:
+        """Return a silhouette whose outline errs, smoothly along it."""
+        width, height = camera.width_px, camera.height_px
+        # The centre of pixel x, less what the image is beside, on the finer grid.
+        column, row = _FINER * (0.5 - beside_px) - 0.5
+        at_centres = cv2.warpAffine(
+            inside_px,
+            np.array([[_FINER, 0.0, column], [0.0, _FINER, row]]),
+            (width, height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
         )
+        coarse = self._rng.normal(size=(height // _SMOOTH_PX + 4, width // _SMOOTH_PX + 4))
+        error = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+        # Between its nodes an interpolated field varies less than at them.
+        error *= self._settings.segmentation_px / np.sqrt(np.mean(error**2))
+        return np.asarray(at_centres > error, np.uint8)
 
 
-def _inside_px(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return how deep the centre of each pixel lies in a silhouette, pixels, negative outside."""
-    size = (_FINER * mask.shape[1], _FINER * mask.shape[0])
-    fine = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
-    depth = cv2.distanceTransform(fine.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    away = cv2.distanceTransform((~fine).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    signed = np.where(fine, depth - 0.5, 0.5 - away) / _FINER
-    return np.asarray(
-        cv2.resize(signed, mask.shape[::-1], interpolation=cv2.INTER_AREA), np.float32
+def _finer(camera: Camera) -> Camera:
+    """Return a camera with so many times as many pixels each way."""
+    scale = np.array([_FINER] * 4 + [1.0] * (len(camera.params) - 4))
+    return replace(
+        camera,
+        width_px=_FINER * camera.width_px,
+        height_px=_FINER * camera.height_px,
+        params=camera.params * scale,
     )
+
+
+def _inside_px(fine: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return how deep each place of a fine grid lies in a silhouette, pixels, negative outside."""
+    inside = (fine > 0).astype(np.uint8)
+    depth = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    away = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(np.where(fine > 0, depth - 0.5, 0.5 - away) / _FINER, np.float32)
 
 
 def payload(arguments: argparse.Namespace) -> None:
