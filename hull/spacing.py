@@ -250,7 +250,7 @@ class _Tally:
 
     def leave_out(self, index: int, time_s: float, reason: str) -> None:
         """Take note of a frame that cannot be evaluated."""
-        unsure = UnsureShifts(NOTHING, np.nan, 0)
+        unsure = UnsureShifts(NOTHING, np.nan, np.nan, 0)
         self._note(index, time_s, reason, BlockedShifts(NOTHING, NOTHING, 0), unsure, 0.0)
 
     def look(self, index: int, time_s: float, hull: Hull, doubts: FrameDoubts | None) -> None:
@@ -273,7 +273,7 @@ class _Tally:
         for number, one in enumerate(layout.standing):
             verdict = verdict_at(hull, one, layout.move, 0.0)
             self._standing[number] += (verdict == "violates", verdict == "undecided")
-        unsure = UnsureShifts(NOTHING, np.nan, 0)
+        unsure = UnsureShifts(NOTHING, np.nan, np.nan, 0)
         if doubts is not None:
             unsure = unsure_shifts(doubts, layout.moved, layout.move, blocked)
         self._note(index, time_s, "", blocked, unsure, time.perf_counter() - started)

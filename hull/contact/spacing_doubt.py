@@ -1,11 +1,12 @@
 """What errors of outlines and cameras do to the room a task needs: the shift that suffices at 95 %.
 
 Let c(s) be the clearance that the hull of one frame keeps from an object moved by s, found from
-silhouettes and cameras that err; its standard deviation is sigma (`hybridve.hull.contact
-.uncertainty`: segmentation, undistortion, rounding, and the rig's covariance). With C the clearance
-that is required, a frame is *sure to keep it at 95 %* where
+silhouettes and cameras that err: too large by more than q in 5 % of recordings
+(`hybridve.hull.contact.uncertainty`: segmentation, undistortion, rounding, and the rig's
+covariance; q is 1.645 standard deviations, or more where any of several cameras ends the hull).
+With C the clearance that is required, a frame is *sure to keep it at 95 %* where
 
-    c(s) - 1.645 sigma >= C,
+    c(s) - q >= C,
 
 which is what ``clearance_at_least_m`` of a report says of the layout moved by s. The shift that
 suffices at 95 % is the smallest one at which every frame is sure to keep what every object
@@ -17,7 +18,7 @@ Let T be the shift that is truly needed, found from true silhouettes and true ca
 frame (and object) that truly decides it: moved by less than T, b falls short of C. Which one that
 is is a fact of what was recorded; no error changes it. The shift told is below T only if b, too, is
 taken to be sure of its clearance there, for which its own clearance must be found too large by more
-than 1.645 sigma: in 5 % of recordings. What all other frames say can only raise the answer.
+than q: in 5 % of recordings. What all other frames say can only raise the answer.
 
 So nothing need be known of how errors hang together from frame to frame: not that all share the
 cameras', nor that outlines of neighbouring frames of a slow motion err alike. What it costs is that
@@ -34,11 +35,11 @@ What is assumed
 ---------------
 * Errors are normal and small against what they act on. Of a thing thinner than its outlines' errors
   the silhouette may lack the whole, and no deviation tells of that.
-* sigma is that at the ends of the shifts that a frame is not sure of, the largest of them where
-  there are several, one of each object. It is found by going round: shifts for a sigma, sigma at
-  their ends, until they agree.
+* q is that at the ends of the shifts that a frame is not sure of, the largest of them where
+  there are several, one of each object. It is found by going round: shifts for a q, q at their
+  ends, until they agree.
 * One end decides. If what is free ends again farther away, there is another end with 5 % of its
-  own, which matters where the stretch is about as narrow as sigma.
+  own, which matters where the stretch is about as narrow as q.
 * The hull holds whatever is real, and is larger where no camera looks: what real things need is
   less than T, never more.
 """
@@ -60,17 +61,18 @@ from hybridve.hull.contact.spacing import (
     union,
     without,
 )
-from hybridve.hull.contact.uncertainty import ONE_SIDED_95, FrameDoubts
+from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Deviation, FrameDoubts
 from hybridve.hull.query.silhouettes import Views
 
 #: A frame is first asked for so many times the deviation that a pixel's size makes likely. One that
-#: keeps that too is left alone, so it is generous.
+#: keeps even that is left alone, so it is generous.
 _LOOK = 3.0
 
-#: Times that shifts and their deviation are found from each other, at most. Most often it is two.
+#: Times that shifts and what their ends may be off are found from each other, at most; most often
+#: it is two or three.
 _MOST_ROUNDS = 8
 
-#: The deviation that shifts were found for may be larger than that at their ends by this share.
+#: What shifts were found for may be larger than what their ends may be off, by this share.
 _AGREE = 0.02
 
 
@@ -84,14 +86,17 @@ class UnsureShifts:
         Stretches of shifts, ascending and apart, metres. Those that violate what is required, and
         those of which that is unknown, are among them.
     std_m : float
-        Standard deviation of the clearance that they were found for, metres: the largest of all
-        objects; NaN where none comes near.
+        Standard deviation of the clearance at their ends, metres: where it may be found too large
+        by most; of several objects the largest; NaN where none comes near.
+    too_large_95_m : float
+        By how much it is found too large there in no more than 5 % of recordings; likewise.
     n_measured : int
         How many measurements that took.
     """
 
     unsure_m: NDArray[np.float64]
     std_m: float
+    too_large_95_m: float
     n_measured: int
 
 
@@ -112,13 +117,14 @@ def unsure_shifts(
         What `hybridve.hull.contact.spacing.blocked_shifts` found of the frame.
     """
     unsure_m = union(blocked.violated_m, blocked.undecided_m)
-    std_m, n_measured = np.nan, 0
+    std_m, too_large_m, n_measured = np.nan, np.nan, 0
     for one in objects:
         found = _unsure_of(doubts, one, move, blocked.violated_m)
         unsure_m = union(unsure_m, found.unsure_m)
         std_m = float(np.fmax(std_m, found.std_m))
+        too_large_m = float(np.fmax(too_large_m, found.too_large_95_m))
         n_measured += found.n_measured
-    return UnsureShifts(unsure_m, std_m, n_measured)
+    return UnsureShifts(unsure_m, std_m, too_large_m, n_measured)
 
 
 def _unsure_of(
@@ -126,11 +132,11 @@ def _unsure_of(
 ) -> UnsureShifts:
     """Return the shifts at which a frame is not sure to keep one object's clearance."""
     whole_m = np.array([[move.start_m, move.stop_m]])
-    std_m = _LOOK * _likely_std_m(doubts)
+    margin_m = _LOOK * ONE_SIDED_95 * _likely_std_m(doubts)
     known_m, free_m = violated_m, NOTHING
     n_measured, has_grown = 0, False
     for _ in range(_MOST_ROUNDS):
-        wider = replace(one, clearance_m=one.clearance_m + ONE_SIDED_95 * std_m)
+        wider = replace(one, clearance_m=one.clearance_m + margin_m)
         more_m, undecided_m, n_more = blocked_by(doubts.hull, wider, move, known_m, free_m)
         n_measured += n_more
         unsure_m = union(more_m, undecided_m)
@@ -138,23 +144,25 @@ def _unsure_of(
         ends_m = _ends_of(free_of(move, unsure_m), move)
         ends_m = ends_m[~np.isin(ends_m, violated_m)]
         if len(ends_m) == 0:
-            return UnsureShifts(unsure_m, np.nan, n_measured)
-        found_m = float(np.max([_std_at(doubts, one, move, float(at)) for at in ends_m]))
+            return UnsureShifts(unsure_m, np.nan, np.nan, n_measured)
+        found = [_deviation_at(doubts, one, move, float(at)) for at in ends_m]
         n_measured += len(ends_m)
+        worst = found[int(np.argmax([other.too_large_95_m for other in found]))]  # or NaN
+        std_m, found_m = worst.std_m, worst.too_large_95_m
         if not np.isfinite(found_m):  # no direction leads from the hull: nothing is sure
-            return UnsureShifts(whole_m, found_m, n_measured)
-        tolerance_m = METER_SHARE * move.tolerance_m / ONE_SIDED_95
-        is_enough = found_m <= std_m + tolerance_m
-        if is_enough and (has_grown or std_m <= (1.0 + _AGREE) * found_m + tolerance_m):
+            return UnsureShifts(whole_m, np.nan, np.nan, n_measured)
+        tolerance_m = METER_SHARE * move.tolerance_m
+        is_enough = found_m <= margin_m + tolerance_m
+        if is_enough and (has_grown or margin_m <= (1.0 + _AGREE) * found_m + tolerance_m):
             break
         has_grown = has_grown or not is_enough
         # Of a larger clearance less is kept, and more violated.
-        if found_m > std_m:
+        if found_m > margin_m:
             known_m, free_m = more_m, NOTHING
         else:
             known_m, free_m = violated_m, without(whole_m, unsure_m)
-        std_m = found_m
-    return UnsureShifts(unsure_m, std_m, n_measured)
+        margin_m = found_m
+    return UnsureShifts(unsure_m, std_m, margin_m, n_measured)
 
 
 def _ends_of(free_m: NDArray[np.float64], move: Move) -> NDArray[np.float64]:
@@ -163,11 +171,10 @@ def _ends_of(free_m: NDArray[np.float64], move: Move) -> NDArray[np.float64]:
     return np.asarray(ends_m[(ends_m > move.start_m) & (ends_m < move.stop_m)])
 
 
-def _std_at(doubts: FrameDoubts, one: MovedObject, move: Move, shift_m: float) -> float:
-    """Return the standard deviation of the clearance of an object moved so far, metres."""
+def _deviation_at(doubts: FrameDoubts, one: MovedObject, move: Move, shift_m: float) -> Deviation:
+    """Return how far the clearance of an object moved so far may be off."""
     shift_world = shift_m * move.direction
-    clearance = one.meter.measure(doubts.hull, shift_world)
-    return doubts.deviation(one.meter, clearance, shift_world)[0]
+    return doubts.deviation(one.meter, one.meter.measure(doubts.hull, shift_world), shift_world)
 
 
 def _likely_std_m(doubts: FrameDoubts) -> float:
