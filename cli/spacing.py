@@ -280,7 +280,7 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
         "smallest shift": _answer(one.shift_m, start_m, stop_m),
         "it is at least": "-" if math.isnan(one.at_least_m) else _mm(one.at_least_m),
         "suffices at 95 %": "",
-        "decided by": "",
+        "at 95 % decided by": "",
         "kept at": _ranges(one),
         "decided by frame": "-",
         "time": "-",
@@ -304,7 +304,9 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
     if one.doubt is not None:
         text["suffices at 95 %"] = _answer(one.doubt.shift_m, start_m, stop_m)
         if one.doubt.frame is not None:
-            text["decided by"] = f"frame {one.doubt.frame}, +- {_mm(one.doubt.std_m)}"
+            text["at 95 % decided by"] = (
+                f"frame {one.doubt.frame}, there known to +- {_mm(one.doubt.std_m)}"
+            )
     n_valid = frames.n_valid
     ends = ((0, start_m), (-1, stop_m))
     text |= {
