@@ -103,10 +103,10 @@ _NEAR_PX = 1.5
 _MOST_RESIDUAL = 0.35
 
 #: Sets of cones end the hull where the combination of their normals is by no more than this farther
-#: from the direction than the best (about 11 degrees). An outline that errs by e moves the point
-#: that is nearest sideways, by sqrt(2 e / r) radians of a thing of radius r: 0.2 for 1 px of 4 mm of
-#: a forearm. Less of it leaves out cameras that end the hull just as well; more lets cones count
-#: that do not, and tells too little.
+#: from the direction than the best (about 11 degrees). An outline that errs by e moves the nearest
+#: point of a thing of radius r sideways, to where its normal is turned by sqrt(2 e / r) radians:
+#: 0.2 for a millimetre and a forearm of 5 cm. Less would leave out cameras that end the hull just
+#: as well; more would count some that do not, and ask for more room than need be.
 _AS_GOOD = 0.2
 
 #: Draws from which the 95 % of several sets of cones together are found, to about 2 %.
