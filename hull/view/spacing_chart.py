@@ -148,7 +148,7 @@ def draw_spacing_chart(curves: Sequence[ShiftCurve], *, title: str) -> Figure:
     axes.set_axisbelow(True)
     title_of_legend = "smallest shift that no frame violates"
     if any(curve.doubt is not None for curve in curves):
-        title_of_legend += "\n(dotted, hollow: that is sure not to, given the outlines' errors)"
+        title_of_legend += "\ndotted, hollow: the same at 95 %, as outlines and cameras err"
     axes.legend(title=title_of_legend, fontsize=8, title_fontsize=8)
     figure.suptitle("\n".join(textwrap.wrap(title, 100)), fontsize=10)
     return figure
