@@ -729,6 +729,8 @@ def _any_beyond(ways_m: NDArray[np.float64], covariance_px2: NDArray[np.float64]
 
     e (C,) is normal with mean 0.
     """
+    matters = ways_m.any(axis=0)  # what other cameras do changes nothing, not even the draws
+    ways_m, covariance_px2 = ways_m[:, matters], covariance_px2[np.ix_(matters, matters)]
     spread, axes = np.linalg.eigh(covariance_px2)
     across_m = ways_m @ (axes * np.sqrt(np.maximum(spread, 0.0)))  # (V, C)
     return float(np.quantile((_draws(len(spread)) @ across_m.T).max(axis=1), 0.95))
