@@ -10,6 +10,7 @@ EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
+    from hybridve.hull.contact.uncertainty import DoubtSettings
     from hybridve.hull.evaluate import EvaluateSettings
 
 FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
@@ -119,7 +120,7 @@ def output_option(what: str) -> Callable[[FC], FC]:
 
 def response_options(command: FC) -> FC:
     """Add the options of clearance, response and doubt; see `evaluation_of`."""
-    clearance, response, doubt = "Clearance", "Response", "Doubt"
+    clearance, response = "Clearance", "Response"
     added = (
         click.option(
             "--clearance-mm",
@@ -173,25 +174,41 @@ def response_options(command: FC) -> FC:
             help="When a contact begins, take the point of first contact for CP_obj instead of the "
             "collision point farthest from RP_obj.",
         ),
-        click.option(
-            "--doubt/--no-doubt",
-            cls=GroupedOption,
-            heading=doubt,
-            default=True,
-            help="Tell what outlines, calibration and single cameras do to every clearance and "
-            "verdict; needs the clearance. Default: do.",
-        ),
-        click.option(
-            "--mask-std-px",
-            cls=GroupedOption,
-            heading=doubt,
-            type=click.FloatRange(0),
-            help="Standard deviation of the silhouettes' outlines, pixels. Default: 1.5.",
+        doubt_options(
+            "Tell what outlines, calibration and single cameras do to every clearance and verdict; "
+            "needs the clearance. Default: do."
         ),
     )
     for option in reversed(added):
         command = option(command)
     return command
+
+
+def doubt_options(what: str) -> Callable[[FC], FC]:
+    """Return the options of doubt, which tells what `what` says; see `doubt_of`."""
+
+    def added(command: FC) -> FC:
+        command = click.option(
+            "--mask-std-px",
+            cls=GroupedOption,
+            heading="Doubt",
+            type=click.FloatRange(0),
+            help="Standard deviation of the silhouettes' outlines, pixels. Default: 1.5.",
+        )(command)
+        return click.option(
+            "--doubt/--no-doubt", cls=GroupedOption, heading="Doubt", default=True, help=what
+        )(command)
+
+    return added
+
+
+def doubt_of(*, doubt: bool, mask_std_px: float | None) -> "DoubtSettings | None":
+    """Return what the options of `doubt_options` ask to assume of outlines; None for no doubt."""
+    if not doubt:
+        return None
+    from hybridve.hull.contact.uncertainty import DoubtSettings
+
+    return DoubtSettings() if mask_std_px is None else DoubtSettings(segmentation_px=mask_std_px)
 
 
 def evaluation_of(
@@ -220,19 +237,13 @@ def evaluation_of(
 
     if backtrack and not response:
         raise click.UsageError("--backtrack says where the response begins; drop --no-response")
-    assumed = None
-    if doubt and clearance_mm:
-        from hybridve.hull.contact.uncertainty import DoubtSettings
-
-        known = {} if mask_std_px is None else {"segmentation_px": mask_std_px}
-        assumed = DoubtSettings(**known)
     return EvaluateSettings(
         clearance_m=clearance_mm / 1000.0 or None,
         response=ResponseSettings(radians(abc_deg), abc_mm / 1000.0, abc_window)
         if response
         else None,
         backtrack=backtrack,
-        doubt=assumed,
+        doubt=doubt_of(doubt=doubt and clearance_mm > 0, mask_std_px=mask_std_px),
         **others,
     )
 

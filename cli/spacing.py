@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,10 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
-@click.command(short_help="Find how far to move an object for a recorded task to have room.")
+@click.command(
+    cls=options.GroupedCommand,
+    short_help="Find how far to move an object for a recorded task to have room.",
+)
 @options.sessions_arg
 @options.scene_option
 @click.option(
@@ -81,6 +85,9 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     help="Grow all silhouettes by so many pixels, for room to spare: the answer then holds for "
     "outlines that are off by less.",
 )
+@options.doubt_options(
+    "Tell the shift that suffices at 95 %, as outlines and calibration err, too. Default: do."
+)
 @options.frames_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="The file to write, SPACING.h5."
@@ -107,6 +114,8 @@ def spacing(
     clearance_mm: float | None,
     tolerance_mm: float,
     grow_px: int,
+    doubt: bool,
+    mask_std_px: float | None,
     frames: "FrameRange",
     output: Path | None,
     picture: Path | None,
@@ -118,8 +127,10 @@ def spacing(
     r"""Find the smallest shift of an object at which the whole recording keeps clear of it.
 
     The shift found is proved to keep the required clearance in every frame, and that the smallest
-    one is "at least" so much is proved too; as a rule less than the tolerance lies between. Each
-    recording is replayed once, for all shifts. Several SESSIONs are columns of the table.
+    one is "at least" so much is proved too; as a rule less than the tolerance lies between. Both
+    hold for the silhouettes as they are. The shift that "suffices at 95 %" is an estimate that
+    reckons with the errors of outlines and cameras: it is what to build by. Each recording is
+    replayed once, for all shifts. Several SESSIONs are columns of the table.
 
     \b
     Example:
@@ -159,7 +170,9 @@ def spacing(
     layout = Layout.of(
         loaded_scene, moved, move, None if clearance_mm is None else clearance_mm / 1e3
     )
-    settings = EvaluateSettings(frames=frames)
+    settings = EvaluateSettings(
+        frames=frames, doubt=options.doubt_of(doubt=doubt, mask_std_px=mask_std_px)
+    )
     chains = [make_chain(load_session(path), loaded_scene, settings) for path in sessions]
 
     found = []
@@ -191,6 +204,7 @@ def spacing(
             "stop_m": move.stop_m,
             "tolerance_m": move.tolerance_m,
             "grow_px": grow_px,
+            "doubt": None if settings.doubt is None else asdict(settings.doubt),
             "frames": str(frames),
         },
         sessions=tuple(found),
@@ -262,13 +276,11 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
     """Return what the table says of one session."""
     frames, curve, binding = one.frames, one.curve, one.binding
     start_m, stop_m = (float(curve.shift_m[end]) for end in (0, -1))
-    if math.isnan(one.shift_m):
-        answer = f"none up to {1e3 * stop_m:g}"
-    else:
-        answer = _mm(one.shift_m) + (" (the first)" if one.shift_m == start_m else "")
     text = {
-        "smallest shift": answer,
+        "smallest shift": _answer(one.shift_m, start_m, stop_m),
         "it is at least": "-" if math.isnan(one.at_least_m) else _mm(one.at_least_m),
+        "suffices at 95 %": "",
+        "at 95 % decided by": "",
         "kept at": _ranges(one),
         "decided by frame": "-",
         "time": "-",
@@ -289,6 +301,12 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
         }
         if math.isnan(one.shift_m):
             text["clearance there"] += f", at {1e3 * stop_m:g}"
+    if one.doubt is not None:
+        text["suffices at 95 %"] = _answer(one.doubt.shift_m, start_m, stop_m)
+        if one.doubt.frame is not None:
+            text["at 95 % decided by"] = (
+                f"frame {one.doubt.frame}, there known to +- {_mm(one.doubt.std_m)}"
+            )
     n_valid = frames.n_valid
     ends = ((0, start_m), (-1, stop_m))
     text |= {
@@ -302,6 +320,13 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
     left_out = len(frames.index) - n_valid
     text["frames left out"] = f"{left_out}" if left_out else ""
     return text
+
+
+def _answer(shift_m: float, start_m: float, stop_m: float) -> str:
+    """Return a shift that was sought in a range, or that there is none."""
+    if math.isnan(shift_m):
+        return f"none up to {1e3 * stop_m:g}"
+    return _mm(shift_m) + (" (the first)" if shift_m == start_m else "")
 
 
 def _ranges(one: "SessionSpacing") -> str:

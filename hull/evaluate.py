@@ -365,22 +365,10 @@ class _Tools:
                 )
                 for part in chain.scene.objects
             ]
-        doubter = None
+        doubter = make_doubter(chain) if "doubt" in computed_parts(settings) else None
         error_px = np.full(len(chain.views), DEFAULT_ERROR_PX)
-        if "doubt" in computed_parts(settings):
-            # Late: it brings scipy's optimisers, for which a picture or a sweep need not wait.
-            from hybridve.hull.contact.uncertainty import Doubter, outline_errors
-
-            names, shift_px = chain.views.names, _mask_shift_px(chain)
-            errors = outline_errors(
-                names,
-                chain.rig.provenance,
-                [shift_px[name] for name in names],
-                settings.doubt,
-                chain.rig,
-            )
-            doubter = Doubter(errors, settings.doubt)
-            error_px = stated_error_px(errors.sigma_px)
+        if doubter is not None:
+            error_px = stated_error_px(doubter.errors.sigma_px)
         is_still = not chain.tracks
         pencils = make_pencils(chain.views) if is_still else None
         shares = _shares_seen(chain, chain.views) if is_still else []
@@ -641,6 +629,24 @@ def about_rig(chain: Chain) -> dict[str, Any]:
     for entry in about["cameras"]:
         entry["mask_shift_px"] = shift_px.get(entry["name"])
     return about
+
+
+def make_doubter(chain: Chain) -> "Doubter | None":
+    """Return what doubts the clearances of a recording; None where nothing is to be doubted."""
+    if chain.settings.doubt is None:
+        return None
+    # Late: it brings scipy's optimisers, for which a picture or a sweep need not wait.
+    from hybridve.hull.contact.uncertainty import Doubter, outline_errors
+
+    names, shift_px = chain.views.names, _mask_shift_px(chain)
+    errors = outline_errors(
+        names,
+        chain.rig.provenance,
+        [shift_px[name] for name in names],
+        chain.settings.doubt,
+        chain.rig,
+    )
+    return Doubter(errors, chain.settings.doubt)
 
 
 def _mask_shift_px(chain: Chain) -> dict[str, float | None]:

@@ -23,22 +23,26 @@ from hybridve.hull.contact.spacing import (
     MovedObject,
     blocked_shifts,
     covers,
+    free_of,
     tightest_at,
     union,
     verdict_at,
     without,
 )
-from hybridve.hull.evaluate import Chain, resolved_settings, views_at
+from hybridve.hull.contact.spacing_doubt import UnsureShifts, unsure_shifts
+from hybridve.hull.contact.uncertainty import Doubter, FrameDoubts
+from hybridve.hull.evaluate import Chain, make_doubter, resolved_settings, views_at
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.report.spacing_file import (
     Binding,
     SessionSpacing,
     Spacing,
     SpacingCurve,
+    SpacingDoubt,
     SpacingFrames,
     make_stretches,
 )
-from hybridve.hull.view.spacing_chart import ShiftCurve, write_spacing_chart
+from hybridve.hull.view.spacing_chart import DoubtCurve, ShiftCurve, write_spacing_chart
 
 #: Points of a curve at most; what a frame blocks is known for all shifts anyway.
 _MOST_POINTS = 100_000
@@ -157,7 +161,8 @@ def replay(
     name : str
         What the session is called.
     chain : Chain
-        The recording, with the scene of the layout.
+        The recording, with the scene of the layout. What its settings assume of outlines makes the
+        doubt; where they assume nothing, nothing is doubted.
     layout : Layout
         What is moved.
     shifts_m : (S,) float64
@@ -175,7 +180,8 @@ def replay(
     SessionError
         If none of the frames can be evaluated.
     """
-    tally = _Tally(layout)
+    doubter = make_doubter(chain)
+    tally = _Tally(layout, is_doubted=doubter is not None)
     found = silhouettes_of(
         chain.session,
         chain.silhouettes,
@@ -191,7 +197,12 @@ def replay(
                 tally.leave_out(frame.index, time_s, frame.reason)
             else:
                 hull = make_hull(views_at(chain, frame.index), frame.masks)
-                tally.look(frame.index, time_s, grown(hull, grow_px) if grow_px else hull)
+                if grow_px:
+                    hull = grown(hull, grow_px)
+                doubts = None
+                if doubter is not None:
+                    doubts = doubter.frame(hull, chain.tracks.at(frame.index))
+                tally.look(frame.index, time_s, hull, doubts)
             advance()
     if not tally.n_valid:
         raise SessionError(
@@ -199,19 +210,35 @@ def replay(
             "choose others with --frames"
         )
     settings = resolved_settings(chain)
-    kept = ("session", "session_sha256", "frames", "unseen", "min_cameras", "silhouettes")
-    return tally.answer(name, {key: settings[key] for key in kept}, shifts_m)
+    kept = ("session", "session_sha256", "frames", "unseen", "min_cameras", "silhouettes", "doubt")
+    about = {key: settings[key] for key in kept}
+    return tally.answer(name, about | _about_errors(doubter), shifts_m)
+
+
+def _about_errors(doubter: Doubter | None) -> dict[str, object]:
+    """Return what is said of the errors that were reckoned with, as plain JSON values."""
+    if doubter is None:
+        return {}
+    errors = doubter.errors
+    return {
+        "outline_std_px": errors.sigma_px.tolist(),
+        "calibration": "covariance"
+        if errors.rig is not None
+        else ["measured" if known else "assumed" for known in errors.is_measured.tolist()],
+    }
 
 
 class _Tally:
     """What the frames that were looked at say together. No hull is kept."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: Layout, *, is_doubted: bool) -> None:
         self._layout = layout
+        self._is_doubted = is_doubted
         self._index: list[int] = []
         self._time_s: list[float] = []
         self._reason: list[str] = []
         self._blocked: list[BlockedShifts] = []
+        self._unsure: list[UnsureShifts] = []
         self._measure_s: list[float] = []
         self._together = NOTHING
         self._at_end: dict[float, Binding] = {}
@@ -224,10 +251,14 @@ class _Tally:
 
     def leave_out(self, index: int, time_s: float, reason: str) -> None:
         """Take note of a frame that cannot be evaluated."""
-        self._note(index, time_s, reason, BlockedShifts(NOTHING, NOTHING, 0), 0.0)
+        unsure = UnsureShifts(NOTHING, np.nan, np.nan, 0)
+        self._note(index, time_s, reason, BlockedShifts(NOTHING, NOTHING, 0), unsure, 0.0)
 
-    def look(self, index: int, time_s: float, hull: Hull) -> None:
-        """Find out what a frame blocks, and what it is that does where that may be the answer."""
+    def look(self, index: int, time_s: float, hull: Hull, doubts: FrameDoubts | None) -> None:
+        """Find out what a frame blocks, and what it is that does where that may be the answer.
+
+        `doubts` are those of the hull, if it is to be doubted.
+        """
         layout = self._layout
         started = time.perf_counter()
         blocked = blocked_shifts(hull, layout.moved, layout.move)
@@ -243,15 +274,25 @@ class _Tally:
         for number, one in enumerate(layout.standing):
             verdict = verdict_at(hull, one, layout.move, 0.0)
             self._standing[number] += (verdict == "violates", verdict == "undecided")
-        self._note(index, time_s, "", blocked, time.perf_counter() - started)
+        unsure = UnsureShifts(NOTHING, np.nan, np.nan, 0)
+        if doubts is not None:
+            unsure = unsure_shifts(doubts, layout.moved, layout.move, blocked)
+        self._note(index, time_s, "", blocked, unsure, time.perf_counter() - started)
 
     def _note(
-        self, index: int, time_s: float, reason: str, blocked: BlockedShifts, measure_s: float
+        self,
+        index: int,
+        time_s: float,
+        reason: str,
+        blocked: BlockedShifts,
+        unsure: UnsureShifts,
+        measure_s: float,
     ) -> None:
         self._index.append(index)
         self._time_s.append(time_s)
         self._reason.append(reason)
         self._blocked.append(blocked)
+        self._unsure.append(unsure)
         self._measure_s.append(measure_s)
 
     def _binding(self, index: int, time_s: float, hull: Hull, shift_m: float) -> Binding:
@@ -274,10 +315,7 @@ class _Tally:
         """Return what all frames say together."""
         move = self._layout.move
         whole = np.array([[move.start_m, move.stop_m]])
-        free_m = without(whole, self._together)
-        # What is left between two undecided pieces is no place to build anything.
-        is_wide = free_m[:, 1] - free_m[:, 0] >= move.tolerance_m
-        free_m = free_m[is_wide | (free_m[:, 1] == move.stop_m)]
+        free_m = free_of(move, self._together)
         maybe_m = without(whole, union(*(one.violated_m for one in self._blocked)))
         shift_m = float(free_m[0, 0]) if len(free_m) else np.nan
         # What decides ends where the free begins; if nothing is free, it is what is worst at last.
@@ -302,7 +340,13 @@ class _Tally:
                 reason=tuple(self._reason),
                 violated=make_stretches([one.violated_m for one in self._blocked]),
                 undecided=make_stretches([one.undecided_m for one in self._blocked]),
-                n_measured=np.array([one.n_measured for one in self._blocked], np.uint32),
+                n_measured=np.array(
+                    [
+                        one.n_measured + other.n_measured
+                        for one, other in zip(self._blocked, self._unsure, strict=True)
+                    ],
+                    np.uint32,
+                ),
                 measure_s=np.array(self._measure_s),
             ),
             standing={
@@ -311,6 +355,25 @@ class _Tally:
                     self._layout.standing_names, self._standing.tolist(), strict=True
                 )
             },
+            doubt=self._doubt() if self._is_doubted else None,
+        )
+
+    def _doubt(self) -> SpacingDoubt:
+        """Return the shift that suffices at 95 %, and which frame keeps it from being smaller."""
+        move = self._layout.move
+        free_m = free_of(move, union(*(one.unsure_m for one in self._unsure)))
+        shift_m = float(free_m[0, 0]) if len(free_m) else np.nan
+        frame, std_m = None, np.nan
+        end_m = shift_m if len(free_m) else move.stop_m
+        for index, one in zip(self._index, self._unsure, strict=True):
+            if (one.unsure_m[:, 1] == end_m).any() and not std_m >= one.std_m:
+                frame, std_m = index, one.std_m
+        return SpacingDoubt(
+            shift_m=shift_m,
+            frame=frame,
+            std_m=std_m,
+            unsure=make_stretches([one.unsure_m for one in self._unsure]),
+            std_by_frame_m=np.array([one.std_m for one in self._unsure]),
         )
 
     def _counts(
@@ -353,17 +416,22 @@ def curve_of(one: SessionSpacing) -> ShiftCurve:
     """Return the curve of one session with every step where it is, not where it was counted."""
     frames, counted_m = one.frames, one.curve.shift_m
     ends_m = [frames.violated.shift_m.ravel(), frames.undecided.shift_m.ravel()]
+    if one.doubt is not None:
+        ends_m.append(one.doubt.unsure.shift_m.ravel())
     shift_m = np.unique(np.concatenate([counted_m[[0, -1]], *ends_m]))
     middle_m = 0.5 * (shift_m[1:] + shift_m[:-1])
-    violated, at_most = np.zeros(len(middle_m)), np.zeros(len(middle_m))
+    violated, at_most, unsure = (np.zeros(len(middle_m)) for _ in range(3))
     for row in range(len(frames.index)):
         certain = covers(frames.violated.of(row), middle_m)
         violated += certain
         at_most += certain | covers(frames.undecided.of(row), middle_m)
+        if one.doubt is not None:
+            unsure += covers(one.doubt.unsure.of(row), middle_m)
     return ShiftCurve(
         name=f"{one.name} ({frames.n_valid} frames)",
         shift_mm=1e3 * shift_m,
         violated=violated,
         at_most=at_most,
         answer_mm=1e3 * one.shift_m,
+        doubt=None if one.doubt is None else DoubtCurve(unsure, 1e3 * one.doubt.shift_m),
     )

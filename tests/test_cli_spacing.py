@@ -12,7 +12,7 @@ from matplotlib.patches import StepPatch
 
 from hybridve.hull.report.spacing_file import read_spacing, spacing_as_dict
 from hybridve.hull.spacing import curve_of
-from hybridve.hull.view.spacing_chart import ShiftCurve, draw_spacing_chart
+from hybridve.hull.view.spacing_chart import DoubtCurve, ShiftCurve, draw_spacing_chart
 
 Run = Callable[..., int]
 
@@ -67,6 +67,33 @@ def test_silhouettes_are_grown_on_demand_and_that_is_said(
     assert all(wider > narrow for narrow, wider in zip(*answers, strict=True))
     assert run(*task, "--grow-px", 2) == 0
     assert capsys.readouterr().out.splitlines()[0].endswith(", silhouettes grown by 2 px")
+
+
+def test_the_shift_at_95_percent_is_told_and_grows_with_the_outlines_errors(
+    run: Run, task: list[object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = []
+    for std_px in (0.2, 1.0):
+        assert run(*task, "--clearance-mm", 5, "--mask-std-px", std_px, "--json") == 0
+        printed = json.loads(capsys.readouterr().out)
+        assert printed["settings"]["doubt"]["segmentation_px"] == std_px
+        for one in printed["sessions"]:
+            assert one["at_95"]["kind"] == "estimate"
+            assert one["at_95"]["shift_m"] > one["shift_m"]
+        answers.append([one["at_95"]["shift_m"] for one in printed["sessions"]])
+    assert all(more > less for less, more in zip(*answers, strict=True))
+
+    assert run(*task, "--clearance-mm", 5, "--mask-std-px", 1.0) == 0
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if "suffices at 95 %" in line)
+    told_mm = [float(word) for word in row.split()[4:]]
+    assert told_mm == pytest.approx(1e3 * np.array(answers[1]), abs=0.051)
+
+    assert run(*task, "--no-doubt") == 0
+    assert "95 %" not in capsys.readouterr().out
+    assert run(*task, "--no-doubt", "--json") == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["settings"]["doubt"] is None
+    assert [one["at_95"] for one in printed["sessions"]] == [None, None]
 
 
 def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
@@ -179,7 +206,14 @@ def test_wrong_usage_is_status_2_and_says_what(
 def test_the_chart_shows_counts_and_answers_where_they_belong() -> None:
     shift_mm = np.array([0.0, 10.0, 20.0, 30.0])
     curves = [
-        ShiftCurve("p1", shift_mm, np.array([3.0, 1.0, 0.0]), np.array([3.0, 2.0, 0.0]), 20.0),
+        ShiftCurve(
+            "p1",
+            shift_mm,
+            np.array([3.0, 1.0, 0.0]),
+            np.array([3.0, 2.0, 0.0]),
+            20.0,
+            DoubtCurve(np.array([4.0, 3.0, 1.0]), 30.0),
+        ),
         ShiftCurve("p2", shift_mm, np.array([3.0, 3.0, 2.0]), np.array([3.0, 3.0, 2.0]), np.nan),
     ]
 
@@ -191,10 +225,15 @@ def test_the_chart_shows_counts_and_answers_where_they_belong() -> None:
         for values in (curve.violated, curve.at_most):
             assert (values.tolist(), shift_mm.tolist()) in drawn
     lines = [np.asarray(line.get_xdata()).tolist() for line in axes.lines]
-    assert lines == [[20.0, 20.0], [20.0]]
+    assert lines == [[20.0, 20.0], [20.0], [30.0]]
+    assert ([4.0, 3.0, 1.0], shift_mm.tolist()) in drawn
+    assert axes.get_ylim()[1] >= 4.0
     legend = axes.get_legend()
     assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["p1: 20.0 mm", "p2: none is free"]
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "p1: 20.0 mm; at 95 % 30.0 mm",
+        "p2: none is free",
+    ]
 
 
 def test_the_picture_of_a_recording_has_its_steps_where_they_are(
@@ -213,3 +252,8 @@ def test_the_picture_of_a_recording_has_its_steps_where_they_are(
     assert curve.at_most[at_answer - 1] >= 1
     assert curve.violated[0] == one.curve.violated[0]
     assert (curve.violated <= curve.at_most).all()
+    assert curve.doubt is not None
+    assert (curve.at_most <= curve.doubt.unsure).all()
+    assert one.doubt is not None
+    at_95 = np.searchsorted(curve.shift_mm, curve.doubt.answer_mm + 1e-6) - 1
+    assert curve.doubt.unsure[at_95] == 0 < curve.doubt.unsure[at_95 - 1]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -13,11 +14,14 @@ from hybridve.hull.capture.recording import FrameRange, silhouettes_of
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.scene import Scene, load_scene
 from hybridve.hull.contact.spacing import Move, covers, union
+from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import Chain, EvaluateSettings, make_chain
 from hybridve.hull.query.silhouettes import make_hull
 from hybridve.hull.report.spacing_file import (
     SessionSpacing,
     Spacing,
+    SpacingDoubt,
+    make_stretches,
     read_spacing,
     spacing_as_dict,
     write_spacing,
@@ -127,6 +131,103 @@ def test_the_recording_is_what_its_frames_are_one_by_one(
     assert found.at_zero == (int(found.curve.violated[np.abs(shifts_m).argmin()]), 0)
 
 
+@pytest.fixture(scope="module")
+def doubted(chain: Chain, layout: Layout) -> tuple[Chain, SessionSpacing]:
+    settings = replace(chain.settings, doubt=DoubtSettings(segmentation_px=0.5))
+    doubting = replace(chain, settings=settings)
+    return doubting, replay("ball", doubting, layout, shifts_of(MOVE))
+
+
+def test_doubt_adds_room_and_changes_nothing_that_is_proved(
+    found: SessionSpacing, doubted: tuple[Chain, SessionSpacing]
+) -> None:
+    _, with_doubt = doubted
+    assert found.doubt is None
+    assert (with_doubt.shift_m, with_doubt.at_least_m) == (found.shift_m, found.at_least_m)
+    np.testing.assert_array_equal(with_doubt.free_m, found.free_m)
+    for name in ("violated", "undecided"):
+        np.testing.assert_array_equal(
+            getattr(with_doubt.frames, name).shift_m, getattr(found.frames, name).shift_m
+        )
+    doubt = with_doubt.doubt
+    assert doubt is not None
+    assert doubt.frame == 2
+    row = with_doubt.frames.index.tolist().index(2)
+    assert doubt.std_m == doubt.std_by_frame_m[row]
+    # A pixel is 13 mm wide there. The wall is the cube's face, across the move.
+    assert 0.003 < doubt.std_m < 0.03
+    added_m = doubt.shift_m - found.shift_m
+    assert added_m == pytest.approx(1.645 * doubt.std_m, abs=2 * MOVE.tolerance_m)
+
+
+def test_the_recording_needs_at_95_percent_what_the_worst_of_its_frames_does(
+    doubted: tuple[Chain, SessionSpacing], layout: Layout
+) -> None:
+    doubting, together = doubted
+    assert together.doubt is not None
+    alone = []
+    for number in range(len(CENTERS)):
+        settings = replace(doubting.settings, frames=FrameRange(number, number + 1))
+        one = replay("one", replace(doubting, settings=settings), layout, shifts_of(MOVE)).doubt
+        assert one is not None
+        np.testing.assert_array_equal(one.unsure.shift_m, together.doubt.unsure.of(number))
+        alone.append(one.shift_m)
+    assert together.doubt.shift_m == max(alone)
+
+
+def test_where_no_shift_suffices_at_95_percent_that_is_told(
+    chain: Chain, scene: Scene, found: SessionSpacing
+) -> None:
+    move = replace(MOVE, stop_m=found.shift_m + 0.003)
+    settings = replace(chain.settings, doubt=DoubtSettings())
+    layout = Layout.of(scene, ["part"], move, 0.01)
+
+    short = replay("ball", replace(chain, settings=settings), layout, shifts_of(move))
+
+    assert short.shift_m == pytest.approx(found.shift_m, abs=MOVE.tolerance_m)
+    assert short.doubt is not None
+    assert np.isnan(short.doubt.shift_m)
+    assert short.doubt.frame in (1, 2, 3)
+
+
+def test_a_camera_that_looks_aside_abstains_where_the_session_says_so(
+    tmp_path: Path, scene: Scene
+) -> None:
+    """With ``unseen = "keep"`` it is as if it were not there; else nothing that it sees not is."""
+    places = {}
+    for name, extra in (("carve", ""), ("keep", 'unseen = "keep"\nmin_cameras = 3')):
+        path = write_ball_session(tmp_path / name, CENTERS[1:3], n_cameras=5, extra=extra)
+        places[name] = path
+        rows = (path.parent / "rig.csv").read_text(encoding="utf-8").splitlines()
+        told = np.array(rows[0].split(",")[1:], np.float64).reshape(3, 4)
+        told[0] += 3000.0 * told[2]  # its image is far to the side of all that happens
+        rows[0] = ",".join(["cam0", *(repr(float(value)) for value in told.ravel())])
+        (path.parent / "rig.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        for number in range(2):
+            blank = np.zeros_like(cv2.imread(str(path.parent / "cam0" / f"{number}.png"), 0))
+            cv2.imwrite(str(path.parent / "cam0" / f"{number}.png"), blank)
+    others = write_ball_session(tmp_path / "others", CENTERS[1:3], n_cameras=5)
+    text = others.read_text(encoding="utf-8")
+    others.write_text(
+        text.replace('[[camera]]\nname = "cam0"\nmasks = "cam0/*.png"\n', ""), "utf-8"
+    )
+    places["others"] = others
+    answers = {}
+    for name, path in places.items():
+        chain = make_chain(load_session(path), scene, EvaluateSettings(doubt=DoubtSettings(0.5)))
+        answers[name] = replay(name, chain, Layout.of(scene, ["part"], MOVE, 0.01), shifts_of(MOVE))
+
+    assert answers["carve"].shift_m == MOVE.start_m
+    kept, alone = answers["keep"], answers["others"]
+    assert 0.1 < kept.shift_m == alone.shift_m
+    assert kept.doubt is not None
+    assert alone.doubt is not None
+    assert kept.shift_m < kept.doubt.shift_m
+    # The camera that abstains errs without effect.
+    assert kept.doubt.std_m == pytest.approx(alone.doubt.std_m, rel=1e-6)
+    assert kept.settings["unseen"] == "keep"
+
+
 def test_objects_that_stay_are_counted_where_they_stand(found: SessionSpacing) -> None:
     violated, undecided = found.standing["post"]
     assert 1 <= violated < len(CENTERS)
@@ -190,12 +291,22 @@ def test_frames_that_a_camera_lacks_are_left_out(tmp_path: Path, scene: Scene) -
         replay("ball", nothing, layout, shifts_of(MOVE))
 
 
-def test_what_is_written_is_read_back(tmp_path: Path, found: SessionSpacing) -> None:
+def test_what_is_written_is_read_back(
+    tmp_path: Path, found: SessionSpacing, doubted: tuple[Chain, SessionSpacing]
+) -> None:
     path = tmp_path / "spacing.h5"
     unbound = replace(found, name="other", binding=None, at_zero=None, shift_m=np.nan, standing={})
+    n_frames = len(found.frames.index)
+    nowhere = SpacingDoubt(
+        np.nan, None, np.nan, make_stretches([np.zeros((0, 2))] * n_frames),
+        np.full(n_frames, np.nan),
+    )  # fmt: skip
+    _, with_doubt = doubted
+    with_doubt = replace(with_doubt, name="doubted")
+    none_doubted = replace(found, name="nowhere", doubt=nowhere)
     spacing = Spacing(
         "hybridve spacing", "a machine", "2003-04-27", {"numpy": "2"}, {"move": ["part"]},
-        (found, unbound),
+        (found, unbound, with_doubt, none_doubted),
     )  # fmt: skip
 
     write_spacing(path, spacing)
@@ -208,11 +319,16 @@ def test_what_is_written_is_read_back(tmp_path: Path, found: SessionSpacing) -> 
         file.visititems(
             lambda name, one: (
                 missing.append(name)
-                if isinstance(one, h5py.Dataset) and not {"unit", "description"} <= set(one.attrs)
+                if isinstance(one, h5py.Dataset)
+                and not {"unit", "description", "kind"} <= set(one.attrs)
                 else None
             )
         )
         assert missing == []
+        estimated = file["sessions/doubted/at_95"]
+        assert estimated.attrs["kind"] == estimated["unsure/shift_m"].attrs["kind"] == "estimate"
+        assert file["sessions/doubted"].attrs["kind"] == "bound"
+        assert "at_95" not in file["sessions/ball"]  # as of a file that knows of no doubt
         file.attrs["version"] = 2
     with pytest.raises(ReportError, match="spacing version 2, this hybridve reads 1"):
         read_spacing(path)

@@ -42,6 +42,9 @@ _STRIDE = 1.3
 #: Bounds of a measurement are this share of the tolerance apart.
 METER_SHARE = 1.0 / 8.0
 
+#: No stretch at all.
+NOTHING = np.zeros((0, 2))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
@@ -109,7 +112,7 @@ def blocked_shifts(hull: Hull, objects: Sequence[MovedObject], move: Move) -> Bl
     """Return the shifts at which the hull of a frame violates the clearance of any object."""
     violated_m, undecided_m, n_measured = NOTHING, NOTHING, 0
     for one in objects:
-        violated_m, more_m, n_more = _blocked_by(hull, one, move, violated_m)
+        violated_m, more_m, n_more = blocked_by(hull, one, move, violated_m)
         undecided_m = union(undecided_m, more_m)
         n_measured += n_more
     return BlockedShifts(violated_m, without(undecided_m, violated_m), n_measured)
@@ -148,10 +151,6 @@ def tightest_at(
     ]
     tightest = int(np.argmin(spare_m))
     return tightest, found[tightest]
-
-
-#: No stretch at all.
-NOTHING = np.zeros((0, 2))
 
 
 def union(*stretches: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -196,12 +195,49 @@ def covers(stretches: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDA
     return np.asarray(inside, np.bool_)
 
 
-def _blocked_by(
-    hull: Hull, one: MovedObject, move: Move, violated_m: NDArray[np.float64]
+def free_of(move: Move, taken_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the stretches of a range that others (M, 2), ascending and apart, leave.
+
+    Narrower ones than the tolerance are left out, but for one at the end of the range: what is left
+    between two undecided pieces is no place to build anything.
+    """
+    free_m = without(np.array([[move.start_m, move.stop_m]]), taken_m)
+    is_wide = free_m[:, 1] - free_m[:, 0] >= move.tolerance_m
+    return np.asarray(free_m[is_wide | (free_m[:, 1] == move.stop_m)])
+
+
+def blocked_by(
+    hull: Hull,
+    one: MovedObject,
+    move: Move,
+    violated_m: NDArray[np.float64] = NOTHING,
+    free_m: NDArray[np.float64] = NOTHING,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """Return violated stretches, those known already among them, undecided ones, measurements."""
+    """Return the shifts at which a frame does not let one object be, among those not known.
+
+    Parameters
+    ----------
+    hull : Hull
+        The hull of the frame.
+    one : MovedObject
+        The object.
+    move : Move
+        Whereto it is moved.
+    violated_m, free_m : (N, 2) float64
+        Stretches of shifts that are not asked for, as it is known that the one are violated and the
+        other free; each ascending and apart, metres.
+
+    Returns
+    -------
+    violated_m : (N, 2) float64
+        Stretches that certainly violate, those known among them.
+    undecided_m : (M, 2) float64
+        Those of which nothing is known.
+    n_measured : int
+        How many measurements that took.
+    """
     undecided: list[NDArray[np.float64]] = [NOTHING]
-    free_m, n_measured = NOTHING, 0
+    n_measured = 0
     pieces = [(move.start_m, move.stop_m)]
     while pieces:
         piece = np.array([pieces.pop()])

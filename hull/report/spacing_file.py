@@ -8,10 +8,12 @@
     /sessions/NAME/curve/        how many frames violate at each shift
     /sessions/NAME/frames/       per frame: which shifts violate, which are undecided
     /sessions/NAME/free          stretches of shifts at which no frame violates
+    /sessions/NAME/at_95/        the same with errors of outlines and cameras; not where undoubted
     /sessions/NAME/standing/     per object that was not moved: how many frames violate it anyway
 
 Stretches of shifts of all frames stand one below the other; those of frame k are the rows
-``offset[k]`` to ``offset[k + 1]``.
+``offset[k]`` to ``offset[k + 1]``. Every dataset, and every group that holds an answer, says of
+which `kind` it is: exact, a bound given the silhouettes, or an estimate.
 """
 
 import json
@@ -25,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.report.result_file import reading, writing
+from hybridve.hull.report.schema import Kind
 
 FORMAT = "hybridve-spacing"
 VERSION = 1
@@ -149,6 +152,31 @@ class Binding:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SpacingDoubt:
+    """What errors of outlines and cameras do to the answer, an estimate; F frames.
+
+    Attributes
+    ----------
+    shift_m : float
+        The shift that suffices at 95 %; NaN if none in the range does.
+    frame : int or None
+        The number of the frame that decides it; None where the begin of the range suffices.
+    std_m : float
+        Standard deviation of the clearance in that frame; NaN where there is none.
+    unsure : Stretches
+        Shifts at which each frame is not sure, at 95 %, to keep every clearance.
+    std_by_frame_m : (F,) float64
+        Standard deviation of the clearance that these were found for; NaN where nothing is near.
+    """
+
+    shift_m: float
+    frame: int | None
+    std_m: float
+    unsure: Stretches
+    std_by_frame_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SessionSpacing:
     """How much room the task of one recording needs.
 
@@ -177,6 +205,8 @@ class SessionSpacing:
         What each frame says.
     standing : dict of str to (int, int)
         Per object that was not moved how many frames violate its clearance, and how many may.
+    doubt : SpacingDoubt or None
+        What errors do to all this; None where nothing was doubted.
     """
 
     name: str
@@ -189,6 +219,7 @@ class SessionSpacing:
     at_zero: tuple[int, int] | None
     frames: SpacingFrames
     standing: dict[str, tuple[int, int]]
+    doubt: SpacingDoubt | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,6 +282,7 @@ def _write(file: h5py.File, spacing: Spacing) -> None:
 
 
 def _write_session(group: h5py.Group, one: SessionSpacing) -> None:
+    group.attrs["kind"] = "bound"
     group.attrs["shift_m"] = one.shift_m
     group.attrs["at_least_m"] = one.at_least_m
     if one.at_zero is not None:
@@ -260,25 +292,70 @@ def _write_session(group: h5py.Group, one: SessionSpacing) -> None:
         for name in _BINDING:
             binding.attrs[name] = getattr(one.binding, name)
     _store_text(group, "settings", json.dumps(one.settings), "what was recorded, JSON")
-    _store(group, "free", one.free_m, "m", "shifts at which every clearance is proved to be kept")
+    _store(
+        group,
+        "free",
+        one.free_m,
+        "m",
+        "bound",
+        "shifts proved to keep every clearance",
+    )
     curve = group.create_group("curve")
-    _store(curve, "shift_m", one.curve.shift_m, "m", "how far the objects are moved")
-    _store(curve, "violated", one.curve.violated, "1", "frames that certainly violate a clearance")
-    _store(curve, "undecided", one.curve.undecided, "1", "frames of which that is not known")
+    _store(curve, "shift_m", one.curve.shift_m, "m", "exact", "how far the objects are moved")
+    _store(
+        curve,
+        "violated",
+        one.curve.violated,
+        "1",
+        "bound",
+        "frames that surely violate a clearance",
+    )
+    _store(
+        curve, "undecided", one.curve.undecided, "1", "bound", "frames of which that is not known"
+    )
     frames = group.create_group("frames")
-    _store(frames, "index", one.frames.index, "1", "number of the frame in the session")
-    _store(frames, "time_s", one.frames.time_s, "s", "time since the recording began")
+    _store(frames, "index", one.frames.index, "1", "exact", "number of the frame in the session")
+    _store(frames, "time_s", one.frames.time_s, "s", "exact", "time since the recording began")
     _store_text(frames, "reason", list(one.frames.reason), "why a frame could not be evaluated")
-    _store(frames, "n_measured", one.frames.n_measured, "1", "measurements of an object in a place")
-    _store(frames, "measure_s", one.frames.measure_s, "s", "how long they took")
+    _store(
+        frames,
+        "n_measured",
+        one.frames.n_measured,
+        "1",
+        "exact",
+        "measurements of an object in a place",
+    )
+    _store(frames, "measure_s", one.frames.measure_s, "s", "exact", "how long they took")
     for name, what in (("violated", "certainly violate"), ("undecided", "may violate")):
-        stretches: Stretches = getattr(one.frames, name)
-        below = frames.create_group(name)
-        _store(below, "offset", stretches.offset, "1", "where the rows of each frame begin")
-        _store(below, "shift_m", stretches.shift_m, "m", f"begin and end of shifts that {what}")
+        _store_stretches(frames, name, getattr(one.frames, name), "bound", f"shifts that {what}")
     standing = group.create_group("standing", track_order=True)
     for name, counts in one.standing.items():
         standing.attrs[name] = counts
+    if one.doubt is not None:
+        _write_doubt(group.create_group("at_95"), one.doubt)
+
+
+def _write_doubt(group: h5py.Group, doubt: SpacingDoubt) -> None:
+    group.attrs["kind"] = "estimate"
+    group.attrs["shift_m"] = doubt.shift_m
+    group.attrs["std_m"] = doubt.std_m
+    if doubt.frame is not None:
+        group.attrs["frame"] = doubt.frame
+    _store_stretches(
+        group,
+        "unsure",
+        doubt.unsure,
+        "estimate",
+        "shifts at which a clearance is not sure to be kept, at 95 %",
+    )
+    _store(
+        group,
+        "std_by_frame_m",
+        doubt.std_by_frame_m,
+        "m",
+        "estimate",
+        "standard deviation of the clearance, the largest of the objects moved",
+    )
 
 
 #: What is kept of a binding frame, each as an attribute.
@@ -337,6 +414,17 @@ def _read_session(name: str, group: h5py.Group) -> SessionSpacing:
             measure_s=frames["measure_s"][()],
         ),
         standing={key: _pair(counts) for key, counts in group["standing"].attrs.items()},
+        doubt=_read_doubt(group["at_95"]) if "at_95" in group else None,
+    )
+
+
+def _read_doubt(group: h5py.Group) -> SpacingDoubt:
+    return SpacingDoubt(
+        shift_m=float(group.attrs["shift_m"]),
+        frame=int(group.attrs["frame"]) if "frame" in group.attrs else None,
+        std_m=float(group.attrs["std_m"]),
+        unsure=_read_stretches(group["unsure"]),
+        std_by_frame_m=group["std_by_frame_m"][()],
     )
 
 
@@ -349,15 +437,32 @@ def _pair(counts: NDArray[np.int64]) -> tuple[int, int]:
     return first, second
 
 
-def _store(group: h5py.Group, name: str, values: NDArray[Any], unit: str, description: str) -> None:
+def _store_stretches(
+    group: h5py.Group, name: str, stretches: Stretches, kind: Kind, what: str
+) -> None:
+    below = group.create_group(name)
+    _store(below, "offset", stretches.offset, "1", "exact", "where the rows of each frame begin")
+    _store(below, "shift_m", stretches.shift_m, "m", kind, f"begin and end of {what}")
+
+
+def _store(
+    group: h5py.Group,
+    name: str,
+    values: NDArray[Any],
+    unit: str,
+    kind: Kind,
+    description: str,
+) -> None:
     dataset = group.create_dataset(name, data=values, chunks=True, **_STORED)
     dataset.attrs["unit"] = unit
+    dataset.attrs["kind"] = kind
     dataset.attrs["description"] = description
 
 
 def _store_text(group: h5py.Group, name: str, text: str | list[str], description: str) -> None:
     dataset = group.create_dataset(name, data=text, dtype=h5py.string_dtype(), track_times=False)
     dataset.attrs["unit"] = "1"
+    dataset.attrs["kind"] = "exact"
     dataset.attrs["description"] = description
 
 
@@ -373,12 +478,20 @@ def spacing_as_dict(spacing: Spacing) -> dict[str, Any]:
 
 
 def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
-    frames, curve, binding = one.frames, one.curve, one.binding
+    frames, curve, binding, doubt = one.frames, one.curve, one.binding, one.doubt
     return {
         "name": one.name,
         "settings": one.settings,
         "shift_m": _number(one.shift_m),
         "at_least_m": _number(one.at_least_m),
+        "at_95": None
+        if doubt is None
+        else {
+            "kind": "estimate",
+            "shift_m": _number(doubt.shift_m),
+            "frame": doubt.frame,
+            "std_m": _number(doubt.std_m),
+        },
         "binding": None
         if binding is None
         else {
@@ -415,6 +528,8 @@ def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
                 "reason": frames.reason[row],
                 "violated_m": frames.violated.of(row).tolist(),
                 "undecided_m": frames.undecided.of(row).tolist(),
+                "unsure_95_m": None if doubt is None else doubt.unsure.of(row).tolist(),
+                "std_m": None if doubt is None else _number(float(doubt.std_by_frame_m[row])),
                 "measurements": int(frames.n_measured[row]),
             }
             for row in range(len(frames.index))

@@ -78,19 +78,19 @@ def ball_extent(
     axes = to_ball / distances_m[:, None]
     angles = np.arcsin(radius_m / distances_m) + opening_rad
 
-    def inside(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        to_point = to_ball + offset
+    def inside(radii: NDArray[np.float64]) -> NDArray[np.float64]:
+        to_point = to_ball + radius_m * radii
         along = (to_point * axes).sum(axis=1)
         across = np.linalg.norm(to_point - along[:, None] * axes, axis=1)
-        return np.asarray(np.tan(angles) * along - across)
+        return np.asarray((np.tan(angles) * along - across) / radius_m)
 
     best = minimize(
-        lambda offset: -float(normal @ offset),
-        0.5 * radius_m * normal,
-        jac=lambda offset: -normal,
+        lambda radii: -float(normal @ radii),
+        0.5 * normal,
+        jac=lambda radii: -normal,
         constraints={"type": "ineq", "fun": inside},
         method="SLSQP",
-        options={"ftol": 1e-12, "maxiter": 500},
+        options={"ftol": 1e-10, "maxiter": 500},
     )
     assert best.success, best.message
-    return float(-best.fun)
+    return float(-best.fun) * radius_m
