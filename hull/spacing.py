@@ -108,7 +108,8 @@ class Layout:
                 solid_faces=one.solid_faces,
                 tolerance_m=METER_SHARE * move.tolerance_m,
             )
-            return MovedObject(meter, required_m)
+            # Distances are to the triangles, from which the part may be this far.
+            return MovedObject(meter, required_m + one.tessellation_error_m)
 
         moved = [one for one in scene.objects if one.name in names]
         standing = [one for one in scene.objects if one.name not in names]

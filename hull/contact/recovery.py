@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.query.silhouettes import Hull
 
-#: The first step beyond D_rec, as a share of it, and in metres at least; the next are twice as long.
+#: The first step beyond D_rec: a share of it, metres at least. Each next one is twice as long.
 _STEP, _LEAST_STEP_M = 1.0 / 4.0, 1e-3
 
 #: Halvings between a shift that is not certain to free and one that does, until they are this share

@@ -273,8 +273,13 @@ class Hits:
     def ends(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return triangle and sample of those among which is the farthest from any point."""
         topology = self.topology
-        given = (self.start, self.stop, topology.samples_before, topology.viewports)
-        return self.at(run_ends(*map(read_only, given)))
+        ends = run_ends(
+            read_only(self.start),
+            read_only(self.stop),
+            topology.samples_before,
+            topology.viewports,
+        )
+        return self.at(ends)
 
 
 class Closing:

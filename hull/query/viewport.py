@@ -190,8 +190,16 @@ def place_runs(
     """
     count = int((stop - start).sum())
     triangle, positions = np.zeros(count, np.uint32), np.zeros((count, 3))
-    given = (start, stop, before, vertices, faces, viewports)
-    _place_runs(*map(read_only, given), triangle, positions)
+    _place_runs(
+        read_only(start),
+        read_only(stop),
+        read_only(before),
+        read_only(vertices),
+        read_only(faces),
+        read_only(viewports),
+        triangle,
+        positions,
+    )
     return triangle, positions
 
 
