@@ -193,7 +193,7 @@ def test_where_no_shift_suffices_at_95_percent_that_is_told(
 def test_a_camera_that_looks_aside_abstains_where_the_session_says_so(
     tmp_path: Path, scene: Scene
 ) -> None:
-    """With ``unseen = "keep"`` it is as if it were not there; else nothing that it sees not is."""
+    """With ``unseen = "keep"`` it is as if it were not there; else there can be no hull: refused."""
     places = {}
     for name, extra in (("carve", ""), ("keep", 'unseen = "keep"\nmin_cameras = 3')):
         path = write_ball_session(tmp_path / name, CENTERS[1:3], n_cameras=5, extra=extra)
@@ -213,11 +213,12 @@ def test_a_camera_that_looks_aside_abstains_where_the_session_says_so(
     )
     places["others"] = others
     answers = {}
+    with pytest.raises(SessionError, match="cam0 and cam1"):
+        make_chain(load_session(places.pop("carve")), scene, EvaluateSettings())
     for name, path in places.items():
         chain = make_chain(load_session(path), scene, EvaluateSettings(doubt=DoubtSettings(0.5)))
         answers[name] = replay(name, chain, Layout.of(scene, ["part"], MOVE, 0.01), shifts_of(MOVE))
 
-    assert answers["carve"].shift_m == MOVE.start_m
     kept, alone = answers["keep"], answers["others"]
     assert 0.1 < kept.shift_m == alone.shift_m
     assert kept.doubt is not None
