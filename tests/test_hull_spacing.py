@@ -193,7 +193,7 @@ def test_where_no_shift_suffices_at_95_percent_that_is_told(
 def test_a_camera_that_looks_aside_abstains_where_the_session_says_so(
     tmp_path: Path, scene: Scene
 ) -> None:
-    """With ``unseen = "keep"`` it is as if it were not there; else there can be no hull: refused."""
+    """With ``unseen = "keep"`` it is as if it were not there; else no hull can be: refused."""
     places = {}
     for name, extra in (("carve", ""), ("keep", 'unseen = "keep"\nmin_cameras = 3')):
         path = write_ball_session(tmp_path / name, CENTERS[1:3], n_cameras=5, extra=extra)
