@@ -33,7 +33,7 @@ from hybridve.hull.report.write import ReportWriter
 
 # The settings of HDF5 do not matter here; small parts make the joins between them happen.
 _FEW = settings(
-    max_examples=25,
+    max_examples=15,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
