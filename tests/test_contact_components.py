@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.cones import hull_of_balls, views_from
 from helpers.hulls import MASK_KINDS, ball_hull, random_masks, random_views, ring_views
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -191,6 +191,7 @@ def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(2, 5), n_balls=st.integers(1, 4))
+@example(seed=242, n_cameras=2, n_balls=1)
 def test_what_is_called_real_holds_a_part_of_a_real_ball(
     seed: int, n_cameras: int, n_balls: int
 ) -> None:
@@ -209,7 +210,8 @@ def test_what_is_called_real_holds_a_part_of_a_real_ball(
     held = np.unique(volumes.at(np.concatenate(inside)))
     assert NOWHERE not in held, "all cameras see all of the balls"
     assert set(np.flatnonzero(real)) <= set(held.tolist())
-    assert n_balls > 1 or real == [True]
+    # Two cameras that nearly face each other may leave crumbs of the hull far from the ball.
+    assert n_balls > 1 or all(real[volume] for volume in held.tolist())
     # The quick proof claims no more, and tells a ball that stands alone.
     larger = grown(hull)
     for volume in range(len(volumes)):
