@@ -153,7 +153,7 @@ def bench_mesh_and_fcl(benchmark: Any, frames: Any, voxel_mm: float) -> None:
 def horseman(recordings: Path) -> list[Hull]:
     os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
     session = load_session(PROJECT / "data" / "horseman")
-    views, undistortions = rig_views(session, calibrate_session(session))
+    views, undistortions = rig_views(session, calibrate_session(session).rig)
     frames = segmented_frames(session, FrameRange(0, 400, 4), undistortions=undistortions)
     with closing(frames):
         return [make_hull(views, frame.masks) for frame in frames if frame.masks is not None]

@@ -33,7 +33,7 @@ N_FRAMES = 100
 def horseman(recordings: Path) -> tuple[Session, Rig]:
     os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
     session = load_session(PROJECT / "data" / "horseman")
-    return session, calibrate_session(session)
+    return session, calibrate_session(session).rig
 
 
 def subdivided(part: SceneObject, times: int) -> SceneObject:

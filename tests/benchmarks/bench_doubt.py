@@ -47,7 +47,7 @@ pytestmark = pytest.mark.recording
 def hulls(recordings: Path) -> list[Hull]:
     os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
     session = load_session(FOLDER)
-    views, undistortions = rig_views(session, calibrate_session(session))
+    views, undistortions = rig_views(session, calibrate_session(session).rig)
     frames = segmented_frames(session, FrameRange(0, 400, 20), undistortions=undistortions)
     with closing(frames):
         return [make_hull(views, frame.masks) for frame in frames if frame.masks is not None]

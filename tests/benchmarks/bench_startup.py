@@ -84,7 +84,7 @@ def job(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
             (folder / name).write_bytes((PROJECT / "data" / "horseman" / name).read_bytes())
         session, scene = folder / "session.toml", folder / "scene.toml"
         (folder / "rig").mkdir()
-        write_rig(folder / "rig" / "rig.json", calibrate_session(load_session(session)))
+        write_rig(folder / "rig" / "rig.json", calibrate_session(load_session(session)).rig)
     places = ["--scene", str(scene), "-o", str(folder / "report.h5"), "--overwrite"]
     return ["detect", str(session), *places, "--frames", "0:1"]
 
