@@ -1,7 +1,6 @@
 """``hybridve summary``: what a report found, as text, JSON or curves."""
 
 import json
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,7 +81,7 @@ def print_summary(report: "Report") -> None:
     if numbers["frames_without_hull"]:
         empty = options.counted(numbers["frames_without_hull"], "frame")
         click.echo(f"  {empty} without a hull near any object, in which nothing can be touched")
-    for why, count in _rests_on(report).items():
+    for why, count in numbers["rests_on"].items():
         click.echo(f"    {count} x {why}")
     rows = [("object", "verdict", "frames", "certain", "when", *_MOST_OF_A_FRAME)]
     for found in numbers["objects"]:
@@ -136,11 +135,6 @@ def _overall_text(numbers: dict[str, Any]) -> str:
         return f"kept: {whom} the distance"
     found = ", ".join(f"{count} {one}" for one, count in numbers["objects_by_verdict"].items())
     return f"{numbers['verdict']}: {kept} of {every} objects keep their distance ({found})"
-
-
-def _rests_on(report: "Report") -> dict[str, int]:
-    """Return what it rests on that frames have no hull, to how many frames it does."""
-    return dict(Counter(text for text in report.rests_on.tolist() if text))
 
 
 def _frames_text(frames_by_verdict: dict[str, int]) -> str:

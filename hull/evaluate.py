@@ -296,7 +296,7 @@ def evaluate(
             seen = _look(chain, tools, silhouettes, watch)
             state: State = "unread" if seen is None else "evaluated"
             reason = silhouettes.reason
-            if seen is not None and is_contradictory(seen.agreement):
+            if seen is not None and seen.agreement.is_contradictory:
                 state, reason = "contradictory", seen.agreement.reason
             if row >= skip:
                 findings: tuple[Finding, ...] = ()
@@ -313,7 +313,7 @@ def evaluate(
                     rests_on="" if seen is None else seen.agreement.reason,
                     object_share=() if seen is None else tuple(seen.hull.object_shares().tolist()),
                 )
-            is_known = seen is not None and is_believed(seen.agreement)
+            is_known = seen is not None and seen.agreement.is_believed
             before = seen if is_known else None
             row += 1
     if row == 0:
@@ -388,23 +388,6 @@ class _Seen:
     clearances: list[Clearance]
 
 
-def is_contradictory(agreement: Agreement) -> bool:
-    """Tell whether silhouettes cannot all be right: be it that one camera saw nothing at all."""
-    return agreement.kind == "contradiction" or (
-        agreement.kind == "silent" and agreement.is_outside is False
-    )
-
-
-def is_believed(agreement: Agreement) -> bool:
-    """Tell whether the hull may be taken for what was there, be it that nothing was.
-
-    It is not where outlines miss each other, by however little: something was there.
-    """
-    if agreement.kind == "silent":
-        return agreement.is_outside is True
-    return agreement.kind in ("agreed", "nobody", "elsewhere")
-
-
 def _shares_seen(chain: Chain, views: Views) -> list[float]:
     """Return the share of each object's surface that enough cameras see; 0 if that is proved."""
     shares = []
@@ -424,7 +407,7 @@ def _look(
     hull = make_hull(views_at(chain, silhouettes.index), silhouettes.masks)
     time_s = silhouettes.index / chain.session.fps
     agreement = judge_frame(hull, tools.error_px, tools.pencils)
-    if is_contradictory(agreement):
+    if agreement.is_contradictory:
         watch.lap("query")
         return _Seen(silhouettes.index, time_s, hull, agreement, [], [])
     contacts = detect_contacts(hull, chain.bodies, tools.engine)
@@ -528,7 +511,7 @@ def _completed(
         required_m=required_m,
         share_seen=share_seen,
         rests_on=seen.agreement.reason,
-        is_sound=is_believed(seen.agreement),
+        is_sound=seen.agreement.is_believed,
     )
     if finding.clearance is None:
         return finding

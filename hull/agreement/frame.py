@@ -146,6 +146,21 @@ class Agreement:
         return self.kind in {"agreed", "nobody"}
 
     @property
+    def is_contradictory(self) -> bool:
+        """Whether silhouettes cannot all be right, be it that a camera saw nothing at all."""
+        return self.kind == "contradiction" or (self.kind == "silent" and self.is_outside is False)
+
+    @property
+    def is_believed(self) -> bool:
+        """Whether the hull may be taken for what was there, be it that nothing was.
+
+        It is not where outlines miss each other, by however little: something was there.
+        """
+        if self.kind == "silent":
+            return self.is_outside is True
+        return self.kind in {"agreed", "nobody", "elsewhere"}
+
+    @property
     def reason(self) -> str:
         """What is wrong with the frame, in words; empty where it is sound."""
         silent = ", ".join(self.silent)
