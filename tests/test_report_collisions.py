@@ -62,7 +62,7 @@ def test_a_sample_is_every_kth_of_the_points(seed: int, most: int) -> None:
     mesh = stored_mesh(body)
     runs = Runs.of(hits.start, hits.stop, hits.topology.samples_before, body.numbers)
 
-    xyz_m, triangle = mesh.points(runs.thinned(mesh, most), 0)
+    xyz_m, triangle = mesh.points(runs, 0, most)
 
     step = max(1, -(-len(hits) // most))
     expected_m, expected = collision_points(body, hits)

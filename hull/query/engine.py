@@ -19,6 +19,7 @@ from hybridve.hull.query.viewport import (
     read_only,
     run_ends,
     samples_before,
+    thinned_samples,
 )
 
 #: The largest coordinate of a vertex, metres. Squares of what is projected must not overflow in
@@ -257,12 +258,7 @@ class Hits:
 
     def thinned(self, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return triangle and sample of every k-th of the samples inside, at most so many."""
-        lengths = self.stop - self.start
-        ends = np.cumsum(lengths)
-        total = int(ends[-1]) if len(ends) else 0
-        pick = np.arange(0, total, max(1, -(-total // most)))
-        run = np.searchsorted(ends, pick, side="right")
-        return self.at(self.start[run] + pick - (ends[run] - lengths[run]))
+        return self.at(thinned_samples(self.start, self.stop, most))
 
     def at(self, number: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return triangle and number in its viewport of samples (N,) numbered through the mesh."""

@@ -210,6 +210,24 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
+def thinned_samples(
+    start: NDArray[np.int64], stop: NDArray[np.int64], most: int
+) -> NDArray[np.int64]:
+    """Return every k-th of the samples of runs (R,), at most so many, numbered as the runs are.
+
+    Examples
+    --------
+    >>> thinned_samples(np.array([0, 10]), np.array([4, 13]), 4).tolist()
+    [0, 2, 10, 12]
+    """
+    lengths = stop - start
+    ends = np.cumsum(lengths)
+    total = int(ends[-1]) if len(ends) else 0
+    pick = np.arange(0, total, max(1, -(-total // most)))
+    run = np.searchsorted(ends, pick, side="right")
+    return np.asarray(start[run] + pick - (ends[run] - lengths[run]))
+
+
 @compiled
 def run_ends(
     start: NDArray[np.int64],

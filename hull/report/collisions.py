@@ -55,7 +55,9 @@ class StoredMesh:
         """Return the vertices (V, 3) in the report's frame, as they stood in one of its rows."""
         return placed(self.vertices_m, self.placement[row if len(self.placement) > 1 else 0])
 
-    def points(self, runs: "Runs", row: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+    def points(
+        self, runs: "Runs", row: int, most: int | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
         """Return the samples of runs (P, 3), in the report's frame, and each one's triangle (P,).
 
         Parameters
@@ -64,18 +66,24 @@ class StoredMesh:
             Of one row.
         row : int
             Which, for where an object that moves stood.
+        most : int, optional
+            Only every k-th sample, at most so many.
         """
         # Late: it brings compiled code, for which a summary need not wait.
-        from hybridve.hull.query.viewport import place_runs, samples_before
+        from hybridve.hull.query.viewport import place_runs, samples_before, thinned_samples
 
         viewports = self.viewport[self.order].astype(np.int32)
         before = samples_before(viewports)
         place = np.zeros(len(self.order), np.int64)
         place[self.order] = np.arange(len(self.order))
         start = before[place[runs.triangle]] + runs.first
+        stop = start + runs.count
+        if most is not None:
+            start = thinned_samples(start, stop, most)
+            stop = start + 1
         triangle, xyz_m = place_runs(
             start,
-            start + runs.count,
+            stop,
             before,
             self.vertices_at(row),
             self.faces[self.order],
@@ -141,20 +149,3 @@ class Runs:
     def part(self, start: int, stop: int) -> "Runs":
         """Return the runs from one number to before another."""
         return Runs(self.triangle[start:stop], self.first[start:stop], self.count[start:stop])
-
-    def thinned(self, mesh: StoredMesh, most: int) -> "Runs":
-        """Return every k-th of the samples as runs of one each, at most so many."""
-        from hybridve.hull.query.viewport import samples_before
-
-        ends = np.cumsum(self.count, dtype=np.int64)
-        total = int(ends[-1]) if len(ends) else 0
-        if total <= most:
-            return self
-        before = samples_before(mesh.viewport[mesh.order].astype(np.int32))
-        place = np.zeros(len(mesh.order), np.int64)
-        place[mesh.order] = np.arange(len(mesh.order))
-        pick = np.arange(0, total, -(-total // most))
-        run = np.searchsorted(ends, pick, side="right")
-        start = before[place[self.triangle[run]]] + self.first[run]
-        start += pick - (ends[run] - self.count[run])
-        return Runs.of(start, start + 1, before, mesh.order)

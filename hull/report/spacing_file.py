@@ -26,19 +26,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.report.result_file import reading, writing
+from hybridve.hull.report.result_file import STORED, reading, writing
 from hybridve.hull.report.schema import Kind
 
 FORMAT = "hybridve-spacing"
 VERSION = 1
-
-_STORED = {
-    "compression": "gzip",
-    "compression_opts": 1,
-    "shuffle": True,
-    "fletcher32": True,
-    "track_times": False,
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -453,7 +445,7 @@ def _store(
     kind: Kind,
     description: str,
 ) -> None:
-    dataset = group.create_dataset(name, data=values, chunks=True, **_STORED)
+    dataset = group.create_dataset(name, data=values, chunks=True, **STORED)
     dataset.attrs["unit"] = unit
     dataset.attrs["kind"] = kind
     dataset.attrs["description"] = description

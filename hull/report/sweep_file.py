@@ -23,18 +23,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.report.result_file import reading, writing
+from hybridve.hull.report.result_file import STORED, reading, writing
 
 FORMAT = "hybridve-sweep"
 VERSION = 1
-
-_STORED = {
-    "compression": "gzip",
-    "compression_opts": 1,
-    "shuffle": True,
-    "fletcher32": True,
-    "track_times": False,
-}
 
 #: By how much of the time measured the cost model may be off in any row and yet hold.
 _COST_HOLDS = 0.2
@@ -425,7 +417,7 @@ def _read(file: h5py.File) -> Sweep:
 
 def _store(group: h5py.Group, value: object, columns: Mapping[str, tuple[str, str]]) -> None:
     for name, (unit, description) in columns.items():
-        dataset = group.create_dataset(name, data=getattr(value, name), chunks=True, **_STORED)
+        dataset = group.create_dataset(name, data=getattr(value, name), chunks=True, **STORED)
         dataset.attrs["unit"] = unit
         dataset.attrs["description"] = description
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.report.collisions import StoredMesh
+from hybridve.hull.report.result_file import STORED
 
 _VERSION = (2, 2)
 
@@ -30,14 +31,6 @@ _VERTICES, _POLYGONS = 0, 2
 
 #: Collision points of one object in one frame that a sample has at most.
 MOST_SHOWN = 500
-
-_STORED = {
-    "compression": "gzip",
-    "compression_opts": 1,
-    "shuffle": True,
-    "fletcher32": True,
-    "track_times": False,
-}
 
 _CHUNK_ROWS = 16_384
 
@@ -199,7 +192,7 @@ def _before(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _growing(group: h5py.Group, name: str, row: tuple[int, ...], dtype: Any) -> h5py.Dataset:
     return group.create_dataset(
-        name, (0, *row), dtype, chunks=(_CHUNK_ROWS, *row), maxshape=(None, *row), **_STORED
+        name, (0, *row), dtype, chunks=(_CHUNK_ROWS, *row), maxshape=(None, *row), **STORED
     )
 
 
@@ -210,4 +203,4 @@ def _append(dataset: h5py.Dataset, rows: NDArray[Any]) -> None:
 
 
 def _store(group: h5py.Group, name: str, data: NDArray[np.int64]) -> None:
-    group.create_dataset(name, data=data, chunks=True, **_STORED)
+    group.create_dataset(name, data=data, chunks=True, **STORED)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import ReportError
 from hybridve.hull.contact.finding import Finding
 from hybridve.hull.report.collisions import Runs, StoredMesh
+from hybridve.hull.report.result_file import STORED
 from hybridve.hull.report.schema import (
     CAMERA_COLUMNS,
     FORMAT,
@@ -51,14 +52,6 @@ _PART_RUNS = 250_000
 
 #: Rows in one chunk of the file, of those that have many.
 _CHUNK_ROWS = 16_384
-
-_STORED = {
-    "compression": "gzip",
-    "compression_opts": 1,  # twice as quick as the default, files a few per cent larger
-    "shuffle": True,
-    "fletcher32": True,
-    "track_times": False,
-}
 
 
 class ReportWriter:
@@ -246,7 +239,7 @@ class ReportWriter:
             encoded = [str(text).encode() for text in values]
             kind = h5py.string_dtype("utf-8", max(1, *(len(text) for text in encoded)))
             values = np.array(encoded, kind)
-        dataset = group.create_dataset(column.name, data=values, chunks=True, **_STORED)
+        dataset = group.create_dataset(column.name, data=values, chunks=True, **STORED)
         self._describe(dataset, column)
 
     def _describe(self, dataset: h5py.Dataset, column: Column[Any]) -> None:
@@ -291,7 +284,7 @@ class ReportWriter:
             column.dtype,
             chunks=(chunk, *column.shape),
             maxshape=(None, *column.shape),
-            **_STORED,
+            **STORED,
         )
         self._describe(dataset, column)
         start = 0
@@ -318,6 +311,7 @@ class ReportWriter:
     def _points(self, number: int) -> Iterator[FramePoints]:
         """Yield of each part the collision points of an object, all or a sample of them."""
         mesh, row = self._header.meshes[number], 0
+        most = MOST_SHOWN if self._header.points == "sample" else None
         names = ("n_runs", *(column.name for column in RUN_COLUMNS))
         keys = [_object_key(number, name) for name in names]
         for columns in self._part_columns(keys.__contains__):
@@ -326,11 +320,8 @@ class ReportWriter:
             xyz_m = [np.zeros((0, 3), np.float32)]
             triangles = [np.zeros(0, np.uint32)]
             for n_runs in counts.tolist():
-                of_frame = runs.part(start, start + n_runs)
-                if self._header.points == "sample":
-                    of_frame = of_frame.thinned(mesh, MOST_SHOWN)
                 if n_runs:
-                    points_m, on = mesh.points(of_frame, row)
+                    points_m, on = mesh.points(runs.part(start, start + n_runs), row, most)
                     xyz_m.append(points_m.astype(np.float32))
                     triangles.append(on)
                 else:
