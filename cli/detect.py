@@ -55,7 +55,8 @@ COMPARISON = "COMPARISON.csv"
     type=click.Choice(["sample", "all"]),
     default="sample",
     show_default=True,
-    help="Spell all collision points out, for programs that cannot make them from runs.",
+    help="all: spell every collision point out, for programs that cannot make them from runs; "
+    "sample: runs, and some points to look at.",
 )
 @click.option("--resume", is_flag=True, help="Take up a run that was cut off.")
 @options.overwrite_option

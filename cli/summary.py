@@ -17,7 +17,7 @@ _MOST_ENTRIES = 5
 #: Reasons that are told of each object.
 _MOST_WHY = 3
 
-#: Names in a list of objects.
+#: Names in a list of objects, and numbers in one of frames.
 _MOST_NAMES = 8
 
 
@@ -77,7 +77,10 @@ def print_summary(report: "Report") -> None:
         invalid = options.counted(numbers["frames_invalid"], "frame")
         click.echo(f"  {invalid} could not be evaluated:")
         for reason, count in numbers["reasons"].items():
-            click.echo(f"    {count} x {reason}")
+            frames = numbers["reason_frames"][reason]
+            shown = ", ".join(map(str, frames[:_MOST_NAMES]))
+            more = ", ..." if count > _MOST_NAMES else ""
+            click.echo(f"    {count} x {reason} (frame {shown}{more})")
     if numbers["frames_without_hull"]:
         empty = options.counted(numbers["frames_without_hull"], "frame")
         click.echo(f"  {empty} without a hull near any object, in which nothing can be touched")

@@ -310,7 +310,7 @@ def evaluate(
                     findings=findings,
                     stage_s=watch.stage_s,
                     state=state,
-                    rests_on="" if seen is None else seen.agreement.reason,
+                    rests_on=seen.agreement.reason if seen and state == "evaluated" else "",
                     object_share=() if seen is None else tuple(seen.hull.object_shares().tolist()),
                 )
             is_known = seen is not None and seen.agreement.is_believed

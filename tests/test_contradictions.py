@@ -58,6 +58,7 @@ def test_a_contradiction_is_a_row_of_its_own_and_splits_no_contact(
     assert "without cam2 the others agree" in report.reason[2]
     assert hit.verdict.tolist() == ["kept", "clash", "unknown", "clash", "kept"]
     assert hit.why[2] == report.reason[2]
+    assert report.rests_on[2] == ""
     assert hit.certificate[2] == ""
     assert np.isnan(hit["clearance_m"][2]).all()
     # It began once, before; where nothing is known of the frame before, nobody saw it begin.
@@ -66,6 +67,8 @@ def test_a_contradiction_is_a_row_of_its_own_and_splits_no_contact(
     assert (span["first_frame"], span["last_frame"]) == (1, 3)
     assert "without cam2 the others agree" in told
     assert "1 frame could not be evaluated" in told
+    assert told.count("no point is in all of them") == 2  # of the frame, and of the object
+    assert "(frame 2)" in told
     shares = [of_camera["object_share"] for of_camera in report.cameras.values()]
     assert (np.array(shares) > 0).all()
 

@@ -1,13 +1,16 @@
-"""The examples in docstrings are true."""
+"""The examples in docstrings are true, and what the pages name is there."""
 
 import doctest
 import importlib
 import pkgutil
+import re
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 
+PROJECT = Path(__file__).resolve().parent.parent
 PACKAGES = ("hybridve.calib", "hybridve.hull", "hybridve.cli")
 
 
@@ -38,3 +41,15 @@ def test_there_are_examples() -> None:
     ]
 
     assert len(examples) >= 4
+
+
+@pytest.mark.parametrize("page", ["README.md", "tests/README.md", "data/README.md"])
+def test_tests_and_benchmarks_that_a_page_names_exist(page: str) -> None:
+    text = (PROJECT / page).read_text(encoding="utf-8")
+
+    named = set(re.findall(r"((?:property/)?test_\w+\.py|bench_\w+\.py)", text)) - {"test_x.py"}
+
+    for name in named:
+        folders = ["tests/benchmarks"] if name.startswith("bench_") else ["tests", "tests/property"]
+        assert any((PROJECT / folder / name).is_file() for folder in folders), name
+    assert named or page == "data/README.md"

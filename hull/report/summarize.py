@@ -21,7 +21,7 @@ def summarize(report: Report) -> dict[str, Any]:
     dict
         ``verdict`` (the worst of all objects and frames), ``objects_by_verdict`` (how many have
         which), ``report``, ``frames``, ``frames_invalid``, ``frames_contradictory`` (of these),
-        ``reasons`` (text to count),
+        ``reasons`` (text to count) and ``reason_frames`` (text to numbers of frames),
         ``rests_on`` (what the emptiness of frames without a hull rests on, to count),
         ``frames_without_hull`` (see `count_without_hull`), ``seconds`` (from first to last frame),
         ``engine``, ``renderer``, ``stage_ms_mean``, ``viewports`` (smallest and largest),
@@ -67,6 +67,10 @@ def summarize(report: Report) -> dict[str, Any]:
         "frames_invalid": int((~is_valid).sum()),
         "frames_contradictory": int((report.state == "contradictory").sum()),
         "reasons": dict(Counter(report.reason[~is_valid].tolist())),
+        "reason_frames": {
+            why: report.index[report.reason == why].tolist()
+            for why in dict.fromkeys(report.reason[~is_valid].tolist())
+        },
         "rests_on": dict(Counter(text for text in report.rests_on.tolist() if text)),
         "frames_without_hull": count_without_hull(report),
         "seconds": float(report.time_s[-1] - report.time_s[0]) if len(report.time_s) else 0.0,
