@@ -26,6 +26,7 @@ from hybridve.hull.agreement.common_view import common_view
 from hybridve.hull.agreement.frame import (
     DEFAULT_ERROR_PX,
     Agreement,
+    disputes,
     judge_frame,
     stated_error_px,
 )
@@ -69,7 +70,7 @@ from hybridve.hull.query.silhouettes import (
     make_views,
 )
 from hybridve.hull.report.collisions import StoredMesh
-from hybridve.hull.report.schema import FrameResult, Part, State
+from hybridve.hull.report.schema import CameraFrame, FrameResult, Part, State
 
 if TYPE_CHECKING:
     from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings
@@ -311,7 +312,7 @@ def evaluate(
                     stage_s=watch.stage_s,
                     state=state,
                     rests_on=seen.agreement.reason if seen and state == "evaluated" else "",
-                    object_share=() if seen is None else tuple(seen.hull.object_shares().tolist()),
+                    cameras=() if seen is None else seen.cameras,
                 )
             is_known = seen is not None and seen.agreement.is_believed
             before = seen if is_known else None
@@ -384,6 +385,7 @@ class _Seen:
     time_s: float
     hull: Hull
     agreement: Agreement
+    cameras: tuple[CameraFrame, ...]
     contacts: list[Contact]
     clearances: list[Clearance]
 
@@ -406,10 +408,16 @@ def _look(
         return None
     hull = make_hull(views_at(chain, silhouettes.index), silhouettes.masks)
     time_s = silhouettes.index / chain.session.fps
-    agreement = judge_frame(hull, tools.error_px, tools.pencils)
+    pencils = make_pencils(hull.views) if tools.pencils is None else tools.pencils
+    agreement = judge_frame(hull, tools.error_px, pencils)
+    denied_px = {one.camera: one.area_px for one in disputes(hull, tools.error_px, pencils)}
+    cameras = tuple(
+        CameraFrame(share, denied_px.get(name, 0))
+        for name, share in zip(hull.views.names, hull.object_shares().tolist(), strict=True)
+    )
+    watch.lap("agree")
     if agreement.is_contradictory:
-        watch.lap("query")
-        return _Seen(silhouettes.index, time_s, hull, agreement, [], [])
+        return _Seen(silhouettes.index, time_s, hull, agreement, cameras, [], [])
     contacts = detect_contacts(hull, chain.bodies, tools.engine)
     watch.lap("query")
     if tools.certifier is not None:
@@ -427,7 +435,7 @@ def _look(
             for (_, clearance), part in zip(pairs, chain.scene.objects, strict=True)
         ]
     watch.lap("clearance")
-    return _Seen(silhouettes.index, time_s, hull, agreement, contacts, clearances)
+    return _Seen(silhouettes.index, time_s, hull, agreement, cameras, contacts, clearances)
 
 
 def _findings(

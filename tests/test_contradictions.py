@@ -73,6 +73,24 @@ def test_a_contradiction_is_a_row_of_its_own_and_splits_no_contact(
     assert (np.array(shares) > 0).all()
 
 
+def test_what_the_others_deny_of_a_silhouette_is_a_number_of_its_camera(
+    run: Run, tmp_path: Path, session: Path, scene: Path
+) -> None:
+    """Camera 3 sees objects wherever it looks; the hull is that of the others, and they know."""
+    put(session, 3, 1, 255)
+    path = tmp_path / "report.h5"
+
+    assert run("detect", session, "--scene", scene, "-o", path) == 0
+
+    report = read_report(path)
+    assert report.state[1] == "evaluated"
+    denied_px = np.array([of_camera["denied_px"] for of_camera in report.cameras.values()])
+    ball_px = (ball_mask(ring_matrix(3, N_CAMERAS), np.array(TOUCHING)) > 0).sum()
+    assert 0.5 * np.prod(SIZE_PX) < denied_px[3, 1] <= np.prod(SIZE_PX) - ball_px
+    assert (denied_px[:3, 1] == 0).all()
+    assert (denied_px[:, [0, 3, 4]] == 0).all()
+
+
 def test_what_an_empty_hull_rests_on_is_said(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

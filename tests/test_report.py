@@ -27,7 +27,7 @@ from hybridve.hull.contact.verdict import VERDICTS
 from hybridve.hull.report import write
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.read import read_points, read_report
-from hybridve.hull.report.schema import STAGES, FrameResult, Kind, ReportHeader
+from hybridve.hull.report.schema import STAGES, CameraFrame, FrameResult, Kind, ReportHeader
 from hybridve.hull.report.summarize import spans, summarize
 from hybridve.hull.report.write import ReportWriter
 
@@ -141,9 +141,12 @@ def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
         stage_s = dict(zip(STAGES, rng.uniform(size=len(STAGES)).tolist(), strict=True))
         state = draw(st.sampled_from(["unread", "contradictory"])) if reason else "evaluated"
         rests_on = draw(st.sampled_from(["", "left saw nothing"]))
-        share = () if state == "unread" else tuple(rng.uniform(size=len(CAMERAS)).tolist())
+        cameras = tuple(
+            CameraFrame(float(rng.uniform()), int(rng.integers(1 << 20)))
+            for _ in CAMERAS[: 0 if state == "unread" else None]
+        )
         results.append(
-            FrameResult(index, index / 25, reason, findings, stage_s, state, rests_on, share)
+            FrameResult(index, index / 25, reason, findings, stage_s, state, rests_on, cameras)
         )
     return results
 
@@ -182,8 +185,11 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
     assert report.state.tolist() == [result.state for result in results]
     assert report.rests_on.tolist() == [result.rests_on for result in results]
     for number, camera in enumerate(CAMERAS):
-        expected = [one.object_share[number] if one.object_share else np.nan for one in results]
-        np.testing.assert_array_equal(report.cameras[camera]["object_share"], expected)
+        read = report.cameras[camera]
+        expected = [one.cameras[number].object_share if one.cameras else np.nan for one in results]
+        np.testing.assert_array_equal(read["object_share"], expected)
+        denied_px = [one.cameras[number].denied_px if one.cameras else 0 for one in results]
+        assert read["denied_px"].tolist() == denied_px
     assert list(report.objects) == ["object_0", "object_1"]
     for stage in STAGES:
         assert report.stage_s[stage].tolist() == [result.stage_s[stage] for result in results]

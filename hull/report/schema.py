@@ -34,6 +34,7 @@ READ_VERSIONS = (1, 2)
 STAGES = (
     "decode",
     "segment",
+    "agree",
     "query",
     "certify",
     "clearance",
@@ -56,6 +57,22 @@ Part = Literal["contact", "clearance", "first contact", "response", "recovery", 
 State = Literal["evaluated", "unread", "contradictory"]
 
 
+@dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """What is said of one camera's silhouette in one frame.
+
+    Attributes
+    ----------
+    object_share : float
+        The share of its picture that is object.
+    denied_px : int
+        Area of the pieces of it that are proved to be denied by others, square pixels.
+    """
+
+    object_share: float
+    denied_px: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
     """What became of one frame.
@@ -72,8 +89,8 @@ class FrameResult:
         What became of it.
     rests_on : str
         What the hull's emptiness rests on, in words; empty if it is not empty.
-    object_share : tuple of C floats
-        The share of each camera's picture that is object; empty if the frame was not read.
+    cameras : tuple of C CameraFrame
+        What is said of each camera's silhouette; empty if the frame was not read.
     findings : tuple of Finding
         One for each object of the report, in its order; empty if there is a reason.
     stage_s : dict
@@ -88,7 +105,7 @@ class FrameResult:
     stage_s: dict[str, float]
     state: State = "evaluated"
     rests_on: str = ""
-    object_share: tuple[float, ...] = ()
+    cameras: tuple[CameraFrame, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.state == "evaluated") == bool(self.reason):
@@ -307,14 +324,23 @@ _VERDICT: "tuple[Column[Finding], ...]" = (
 )
 
 #: One row a frame, of each camera.
-CAMERA_COLUMNS: tuple[Column[float], ...] = (
+CAMERA_COLUMNS: tuple[Column[CameraFrame], ...] = (
     Column(
         "object_share",
         "1",
         "exact",
         "share of the undistorted picture that is object; NaN if the frame was not read",
         np.float64,
-        lambda share: share,
+        lambda camera: camera.object_share,
+    ),
+    Column(
+        "denied_px",
+        "px^2",
+        "bound",
+        "area of the large pieces of its silhouette that other cameras are proved to deny, beyond "
+        "the stated errors of outlines, at least; 0 of fewer than three cameras, which cannot tell",
+        np.uint32,
+        lambda camera: camera.denied_px,
     ),
 )
 

@@ -402,11 +402,9 @@ def _columns(results: list[FrameResult], header: ReportHeader) -> dict[str, NDAr
 
     columns = {_frame_key(column.name): values(column, results) for column in FRAME_COLUMNS}
     for number in range(len(header.cameras)):
-        shares = [
-            result.object_share[number] if result.object_share else None for result in results
-        ]
+        cameras = [result.cameras[number] if result.cameras else None for result in results]
         for camera_column in CAMERA_COLUMNS:
-            columns[_camera_key(number, camera_column.name)] = values(camera_column, shares)
+            columns[_camera_key(number, camera_column.name)] = values(camera_column, cameras)
     for number in range(len(header.objects)):
         findings = [result.findings[number] if result.is_valid else None for result in results]
         for table in tables_of(header.parts):
