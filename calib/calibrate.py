@@ -19,22 +19,22 @@ from typing import Any
 
 import numpy as np
 
-from hybridve.calib.account import Calibration, put_together
-from hybridve.calib.board import Board, Observations, is_seen
-from hybridve.calib.bundle import adjust
+from hybridve.calib.boards.board import Board, Observations, is_seen
 from hybridve.calib.camera import N_PARAMS
-from hybridve.calib.clock import estimate_offsets, noise_shares, resampled
-from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.fixed_cameras import make_bundle, solve_fixed
 from hybridve.calib.image_io import natural_order
-from hybridve.calib.lens_choice import choose_shared_lens
-from hybridve.calib.lens_fit import FittedLens, LensSettings, fit_shared_lens
-from hybridve.calib.link import link_cameras
-from hybridve.calib.moving_cameras import mount
-from hybridve.calib.observe import CameraInput, observe_boards
+from hybridve.calib.judging.account import Calibration, put_together
+from hybridve.calib.placing.clock import estimate_offsets, noise_shares, resampled
+from hybridve.calib.placing.fixed_cameras import make_bundle, solve_fixed
+from hybridve.calib.placing.link import link_cameras
+from hybridve.calib.placing.moving_cameras import mount
+from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.pose import Pose
-from hybridve.calib.settings import CalibrationSettings, LensRequest
+from hybridve.calib.seeing.corner_cache import CornerCache
+from hybridve.calib.seeing.observe import CameraInput, observe_boards
+from hybridve.calib.solving.bundle import adjust
+from hybridve.calib.solving.lens_choice import choose_shared_lens
+from hybridve.calib.solving.lens_fit import FittedLens, LensSettings, fit_shared_lens
 
 logger = logging.getLogger(__name__)
 

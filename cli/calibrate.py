@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridve.calib.account import Calibration
-    from hybridve.calib.certificate import Certificate, SeenPoints, Volume
-    from hybridve.calib.check import RigCheck
+    from hybridve.calib.judging.account import Calibration
+    from hybridve.calib.judging.certificate import Certificate, SeenPoints, Volume
+    from hybridve.calib.judging.check import RigCheck
     from hybridve.calib.rig import Rig
     from hybridve.hull.capture.session import Session
 
@@ -154,7 +154,7 @@ def calibrate(
 def _check(
     session: "Session", source: Path, unit: str | None, stages: StageProgress, *, as_json: bool
 ) -> None:
-    from hybridve.calib.rig_io import read_any_rig
+    from hybridve.calib.formats.rigs import read_any_rig
     from hybridve.hull.capture.rig import board_sizes
     from hybridve.hull.capture.rig_check import check_session
 
@@ -203,9 +203,9 @@ def _calibrate(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    from hybridve.calib.certificate import SeenPoints, certify, working_volume
-    from hybridve.calib.colmap_io import write_colmap_model
-    from hybridve.calib.rig_io import write_rig
+    from hybridve.calib.formats.colmap import write_colmap_model
+    from hybridve.calib.formats.rigs import write_rig
+    from hybridve.calib.judging.certificate import SeenPoints, certify, working_volume
     from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
     from hybridve.hull.report.write import refuse_existing
 
@@ -273,7 +273,7 @@ def _write_certificate(
 
 def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
     """Leave with a status of its own if the error is not proved to be small enough."""
-    from hybridve.calib.certificate import millimetres
+    from hybridve.calib.judging.certificate import millimetres
 
     error_m = math.nan if certificate is None or certificate.doubts else certificate.error95_m
     if error_m <= max_error_m:
@@ -317,7 +317,7 @@ def _numbers(path: Path, rig: "Rig", certificate: "Certificate | None") -> dict[
 
 
 def _print(numbers: dict[str, Any], certificate: "Certificate | None") -> None:
-    from hybridve.calib.certificate import millimetres
+    from hybridve.calib.judging.certificate import millimetres
 
     if certificate is not None:
         click.echo(certificate.verdict)

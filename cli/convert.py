@@ -8,7 +8,8 @@ import click
 
 from hybridve.cli import options
 
-#: The formats, as `hybridve.calib.rig_io.FORMATS` has them: help must not wait for what reads them.
+#: The formats, as `hybridve.calib.formats.rigs.FORMATS` has them: help must not wait for what reads
+#: them.
 FormatName = Literal[
     "json", "colmap", "opencv", "csv", "caliscope", "aniposelib", "kalibr", "multical"
 ]
@@ -99,7 +100,7 @@ def convert(
       hybridve convert rig/rig.json --to kalibr -o camchain.yaml
       hybridve convert '{camera}/config.xml' --from-unit mm --to colmap -o sparse
     """
-    from hybridve.calib.rig_io import export_rig, output_files, read_any_rig
+    from hybridve.calib.formats.rigs import export_rig, output_files, read_any_rig
     from hybridve.hull.report.write import refuse_existing
 
     found = read_any_rig(

@@ -14,9 +14,9 @@ from hybridve.cli.progress import StageProgress, progress_bar
 from hybridve.hull.contact.verdict import VERDICTS
 
 if TYPE_CHECKING:
+    from hybridve.hull.cad.scene import Scene
     from hybridve.hull.capture.recording import FrameRange
     from hybridve.hull.capture.session import Session
-    from hybridve.hull.contact.scene import Scene
     from hybridve.hull.evaluate import Chain, EvaluateSettings
 
 #: The table of several sessions or layouts, in the folder of their reports.
@@ -112,8 +112,8 @@ def detect(
     import cv2
 
     from hybridve.cli.summary import print_summary
+    from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.contact.scene import load_scene
     from hybridve.hull.evaluate import make_chain
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.summarize import failing, summarize
@@ -227,8 +227,8 @@ def _detect_all(
     One that fails is told and left out, and the others go on.
     """
     from hybridve.calib.errors import HybridveError, ReportError
+    from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.contact.scene import load_scene
     from hybridve.hull.report.compare import (
         Pair,
         compare,

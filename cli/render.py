@@ -47,8 +47,8 @@ def render(
     import numpy as np
 
     from hybridve.calib.errors import ReportError
+    from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.contact.scene import load_scene
     from hybridve.hull.evaluate import EvaluateSettings, make_chain
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.read import read_report

@@ -141,8 +141,8 @@ def spacing(
     import cv2
 
     from hybridve.calib.errors import SessionError
+    from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.contact.scene import load_scene
     from hybridve.hull.evaluate import EvaluateSettings, count_frames, make_chain
     from hybridve.hull.report.compare import distinct_names
     from hybridve.hull.report.machine import machine_text, software_versions

@@ -14,8 +14,8 @@ from hybridve.cli import options
 from hybridve.cli.progress import StageProgress, progress_bar
 
 if TYPE_CHECKING:
+    from hybridve.hull.cad.scene import Scene
     from hybridve.hull.capture.recording import FrameRange
-    from hybridve.hull.contact.scene import Scene
     from hybridve.hull.report.sweep_file import Sweep
     from hybridve.hull.sweep.room import EngineRoom
 
@@ -136,8 +136,8 @@ def sweep(
     """
     import cv2
 
+    from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.contact.scene import load_scene
     from hybridve.hull.evaluate import (
         EvaluateSettings,
         about_objects,

@@ -59,7 +59,7 @@ def synth(
       hybridve synth boxes -o my_session
       hybridve synth payload -o with_tongs --participant 2 --gap-mm 150
     """
-    from hybridve.hull.capture.synth import write_session
+    from hybridve.hull.synth import write_session
 
     chosen = (("participant", participant), ("gap_mm", gap_mm))
     write_session(

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
+from hybridve.calib.formats.rigs import rig_to_dict
 from hybridve.calib.lens import Undistortion, undistortion
 from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import rig_to_dict
 from hybridve.hull.agreement.common_view import common_view
 from hybridve.hull.agreement.frame import (
     DEFAULT_ERROR_PX,
@@ -32,6 +32,7 @@ from hybridve.hull.agreement.frame import (
 )
 from hybridve.hull.agreement.search import Pencils, make_pencils
 from hybridve.hull.agreement.sight import sight_of
+from hybridve.hull.cad.scene import Scene
 from hybridve.hull.capture.recording import (
     FrameRange,
     FrameSilhouettes,
@@ -58,7 +59,6 @@ from hybridve.hull.contact.finding import Finding, agreed, judged, signed_cleara
 from hybridve.hull.contact.patches import contact_patches
 from hybridve.hull.contact.recovery import recover
 from hybridve.hull.contact.respond import Response, ResponseSettings, respond
-from hybridve.hull.contact.scene import Scene
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import (

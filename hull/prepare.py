@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.agreement.frame import disputes, judge_frame
 from hybridve.hull.agreement.sight import sight_of
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings
 from hybridve.hull.contact.clearance import ClearanceMeter
@@ -20,7 +21,6 @@ from hybridve.hull.contact.components import connected_volumes
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
 from hybridve.hull.contact.patches import contact_patches
 from hybridve.hull.contact.respond import collision_point
-from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.jit import FOLDER
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native

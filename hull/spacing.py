@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
+from hybridve.hull.cad.scene import Scene, SceneObject
 from hybridve.hull.capture.recording import silhouettes_of
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
-from hybridve.hull.contact.scene import Scene, SceneObject
 from hybridve.hull.contact.spacing import (
     METER_SHARE,
     NOTHING,

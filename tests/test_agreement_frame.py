@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.calib.rig_io import import_rig
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.hull.agreement.frame import (
     DEFAULT_ERROR_PX,
     deniers,

@@ -7,7 +7,11 @@ import pytest
 from helpers.boards import LENSES
 from helpers.bundles import make_bundle, perturbed
 
-from hybridve.calib.bundle import (
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.lens import img_from_cam
+from hybridve.calib.pose import angle_between, compose, rotation_about_axes
+from hybridve.calib.solving.bundle import (
     Bundle,
     BundleView,
     adjust,
@@ -15,10 +19,6 @@ from hybridve.calib.bundle import (
     moved_pose,
     view_residuals,
 )
-from hybridve.calib.camera import Camera
-from hybridve.calib.errors import CalibrationError
-from hybridve.calib.lens import img_from_cam
-from hybridve.calib.pose import angle_between, compose, rotation_about_axes
 
 #: Noise-free points determine poses to this, metres and radians; rounding alone gives 1e-13.
 EXACT = 1e-8

@@ -21,15 +21,15 @@ from helpers.boards import (
 )
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import open_source
-from hybridve.calib.observe import CameraInput, ObserveSettings
+from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.rig import Rig
-from hybridve.calib.settings import CalibrationSettings
-from hybridve.calib.target import Chessboard, find_corners
+from hybridve.calib.seeing.observe import CameraInput, ObserveSettings
 
 #: Rendered boards of 4 stills place cameras to this, by their distance from the board.
 PLACED = 0.01

@@ -8,16 +8,16 @@ from helpers.boards import board_poses, observe_exactly, project, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridve.calib.board import Sighting
-from hybridve.calib.bundle import POSE
+from hybridve.calib.boards.board import Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
-from hybridve.calib.certificate import Certificate, certify, working_volume
+from hybridve.calib.judging.certificate import Certificate, certify, working_volume
 from hybridve.calib.lens import img_from_cam, parameter_names
 from hybridve.calib.pose import transform
 from hybridve.calib.rig import Rig, RigCovariance
-from hybridve.calib.target import Chessboard
-from hybridve.calib.uncertainty import Noise, camera_parameter_names, parameter_slices
+from hybridve.calib.solving.bundle import POSE
+from hybridve.calib.solving.covariance import Noise, camera_parameter_names, parameter_slices
 
 NOISE = Noise(0.2, 0.2, 0.3, 1.0, 100, 10)
 CAMERAS = ring(Chessboard(7, 6, 0.1), ["OPENCV"] * 3)

@@ -11,17 +11,17 @@ from helpers.boards import HEIGHT_PX, WIDTH_PX, look_at, make_camera, project, r
 from helpers.bundles import BOARD as CALIBRATED
 from helpers.bundles import make_bundle
 
-from hybridve.calib.board import Board, Observations, Sighting
-from hybridve.calib.bundle import adjust, moved_pose
+from hybridve.calib.boards.board import Board, Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.check import SCALE_TOLERANCE, SIGNIFICANCE, RigCheck, check_rig
-from hybridve.calib.comparison import chance_of
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.placement import zoomed
+from hybridve.calib.judging.check import SCALE_TOLERANCE, SIGNIFICANCE, RigCheck, check_rig
+from hybridve.calib.judging.comparison import chance_of
 from hybridve.calib.pose import compose, rotation_about_axes
 from hybridve.calib.rig import Rig
-from hybridve.calib.target import Chessboard
-from hybridve.calib.uncertainty import measure_noise, rig_covariance
+from hybridve.calib.solving.bundle import adjust, moved_pose
+from hybridve.calib.solving.covariance import measure_noise, rig_covariance
+from hybridve.calib.solving.placement import zoomed
 
 #: Noise-free corners determine the scale to this, and reprojections in pixels.
 EXACT = 1e-6

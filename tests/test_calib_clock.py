@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
-from hybridve.calib.clock import Clocks, estimate_offsets, resampled
+from hybridve.calib.placing.clock import Clocks, estimate_offsets, resampled
+from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.pose import Pose, rotation_about_axes
-from hybridve.calib.settings import CalibrationSettings
-from hybridve.calib.target import Chessboard
 
 BOARD = Chessboard(7, 6, 0.05)
 SYMMETRIC = Chessboard(8, 6, 0.05)

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridve.calib import corner_cache
-from hybridve.calib.corner_cache import Answer, CornerCache
+from hybridve.calib.seeing import corner_cache
+from hybridve.calib.seeing.corner_cache import Answer, CornerCache
 
 #: Facts, and points with everything that is hard to keep.
 ANSWER: Answer = (

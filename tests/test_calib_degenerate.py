@@ -16,13 +16,15 @@ from helpers.boards import board_poses, look_at, make_camera, observe_exactly, p
 from helpers.recorded_boards import held_up, record, row_of_cameras, see
 from numpy.typing import NDArray
 
-from hybridve.calib.account import Calibration
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
-from hybridve.calib.certificate import Certificate, SeenPoints, certify, working_volume
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.judging.account import Calibration
+from hybridve.calib.judging.certificate import Certificate, SeenPoints, certify, working_volume
 from hybridve.calib.lens import img_from_cam
+from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.pose import (
     Pose,
     angle_between,
@@ -31,8 +33,6 @@ from hybridve.calib.pose import (
     transform,
 )
 from hybridve.calib.rig import Rig
-from hybridve.calib.settings import CalibrationSettings, LensRequest
-from hybridve.calib.target import Chessboard
 
 NOISE_PX = 0.1
 

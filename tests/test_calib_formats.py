@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.rigs import export_rig, import_rig, read_any_rig
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes
 from hybridve.calib.rig import Mount, Rig, RigCovariance
-from hybridve.calib.rig_io import export_rig, import_rig, read_any_rig
 
 EXACT_PX = 1e-9
 

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Sighting
+from hybridve.calib.boards.board import Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.hand_eye import PARAMETERS, mount_camera, solve_hand_eye
+from hybridve.calib.placing.hand_eye import PARAMETERS, mount_camera, solve_hand_eye
 from hybridve.calib.pose import Pose, angle_between, compose, invert
 from hybridve.calib.rig import Mount
-from hybridve.calib.target import Chessboard
 
 BOARD = Chessboard(8, 5, 0.1)
 CAMERA = make_camera("head", "OPENCV", np.eye(3, 4))

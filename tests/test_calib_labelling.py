@@ -14,15 +14,15 @@ from helpers.boards import (
     ring,
 )
 
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.labelling import label_still_boards, unmirrored
-from hybridve.calib.lens_fit import locate_board
+from hybridve.calib.placing.labelling import label_still_boards, unmirrored
+from hybridve.calib.placing.surroundings import describe_scene, with_floor
 from hybridve.calib.pose import compose
-from hybridve.calib.scene import describe_scene, with_floor
-from hybridve.calib.target import Chessboard, find_corners
+from hybridve.calib.solving.lens_fit import locate_board
 
 SIZE_PX = (320, 240)
 

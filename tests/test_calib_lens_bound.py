@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import PINHOLE_MODELS, Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.rigs import import_rig, read_rig, write_rig
 from hybridve.calib.lens import (
     Undistortion,
     cam_from_img,
@@ -26,7 +27,6 @@ from hybridve.calib.lens import (
 )
 from hybridve.calib.lens_bound import Interval, distorted, lens_shift_px
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import import_rig, read_rig, write_rig
 from hybridve.hull.capture.recording import undistort_mask
 
 Array = NDArray[np.float64]

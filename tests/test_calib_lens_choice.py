@@ -8,14 +8,14 @@ import pytest
 from helpers.boards import LENSES, board_poses, make_camera, project
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.lens_choice import CANDIDATES, choose_lens, choose_shared_lens
-from hybridve.calib.lens_fit import fit_lens
 from hybridve.calib.pose import rotation_about_axes, transform
-from hybridve.calib.target import Chessboard
+from hybridve.calib.solving.lens_choice import CANDIDATES, choose_lens, choose_shared_lens
+from hybridve.calib.solving.lens_fit import fit_lens
 
 BOARD = Chessboard(7, 6, 0.1)
 SIZE_PX = (640, 480)

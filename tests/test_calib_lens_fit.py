@@ -7,19 +7,19 @@ import pytest
 from helpers.boards import LENSES, board_poses, make_camera, project
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.lens_fit import (
+from hybridve.calib.pose import Pose, angle_between, rotation_about_axes, transform
+from hybridve.calib.solving.lens_fit import (
     LensSettings,
     fit_lens,
     fit_shared_lens,
     locate_board,
     rays_of,
 )
-from hybridve.calib.pose import Pose, angle_between, rotation_about_axes, transform
-from hybridve.calib.target import Chessboard
 
 #: Noise-free corners determine poses to this (metres, radians) ...
 EXACT = 1e-6

@@ -16,13 +16,13 @@ from helpers.recorded_boards import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.lens_fit import locate_board
-from hybridve.calib.link import Linked, link_cameras, solve_joint
+from hybridve.calib.placing.link import Linked, link_cameras, solve_joint
 from hybridve.calib.pose import Pose, angle_between, compose, invert, transform
-from hybridve.calib.target import Chessboard
+from hybridve.calib.solving.lens_fit import locate_board
 
 #: Noise-free views chain to this: metres and radians.
 EXACT = 1e-7

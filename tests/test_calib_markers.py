@@ -17,12 +17,12 @@ from helpers.marker_boards import (
 )
 from numpy.typing import NDArray
 
-from hybridve.calib.boards import make_board
+from hybridve.calib.boards.markers import AprilGrid, Charuco
+from hybridve.calib.boards.named import make_board
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.markers import AprilGrid, Charuco
 from hybridve.calib.pose import Pose
-from hybridve.calib.target import Chessboard
 
 #: What 9 rays a pixel and noise leave of a point's place.
 RENDERED_RMS_PX = 0.03

@@ -13,15 +13,15 @@ import pytest
 from helpers.boards import board_poses, look_at, make_camera, project, render_board
 from numpy.typing import NDArray
 
-from hybridve.calib import observe
-from hybridve.calib.board import Detection, Effort, Observations, Sighting
+from hybridve.calib.boards.board import Detection, Effort, Observations, Sighting
+from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.camera import Camera
-from hybridve.calib.corner_cache import CornerCache
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import FrameSource, open_source
-from hybridve.calib.observe import CameraInput, ObserveSettings, find_boards, observe_boards
 from hybridve.calib.pose import compose
-from hybridve.calib.target import Chessboard, find_corners
+from hybridve.calib.seeing import observe
+from hybridve.calib.seeing.corner_cache import CornerCache
+from hybridve.calib.seeing.observe import CameraInput, ObserveSettings, find_boards, observe_boards
 
 #: Images searched at once; the tests share the machine.
 SETTINGS = ObserveSettings(threads=2)

@@ -11,17 +11,17 @@ import pytest
 from helpers.boards import turned_about
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations
+from hybridve.calib.boards.board import Observations
+from hybridve.calib.boards.markers import Charuco
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
-from hybridve.calib.check import check_rig
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.image_io import open_source
-from hybridve.calib.markers import Charuco
-from hybridve.calib.observe import CameraInput, ObserveSettings, find_boards, observe_boards
+from hybridve.calib.judging.check import check_rig
+from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import import_rig
-from hybridve.calib.settings import CalibrationSettings
-from hybridve.calib.target import Chessboard
+from hybridve.calib.seeing.observe import CameraInput, ObserveSettings, find_boards, observe_boards
 
 pytestmark = pytest.mark.recording
 

@@ -16,16 +16,16 @@ from helpers.boards import (
 )
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import cam_from_img, img_from_cam
-from hybridve.calib.lens_fit import LensSettings
+from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.pose import angle_between, compose, invert
 from hybridve.calib.rig import Rig
-from hybridve.calib.settings import CalibrationSettings, LensRequest
-from hybridve.calib.target import Chessboard
+from hybridve.calib.solving.lens_fit import LensSettings
 
 #: Noise-free corners determine a rig to this, by the size of the rig and in radians.
 EXACT = 1e-6

@@ -7,11 +7,7 @@ import pytest
 from helpers.boards import look_at, make_camera, project, render_board
 from numpy.typing import NDArray
 
-from hybridve.calib.camera import Camera
-from hybridve.calib.errors import CalibrationError
-from hybridve.calib.lens_fit import locate_board
-from hybridve.calib.pose import transform
-from hybridve.calib.target import (
+from hybridve.calib.boards.target import (
     Chessboard,
     detect_corners,
     find_corners,
@@ -19,6 +15,10 @@ from hybridve.calib.target import (
     read_corners,
     refine_corners,
 )
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.pose import transform
+from hybridve.calib.solving.lens_fit import locate_board
 
 #: What 16 rays a pixel and 256 grey levels leave of a corner's place; half a pixel is far more.
 RENDERED_RMS_PX = 0.03

@@ -21,11 +21,11 @@ from helpers.theory import (
 )
 from numpy.typing import NDArray
 
-from hybridve.calib.bundle import Bundle, adjust, view_residuals
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.pose import angle_between
 from hybridve.calib.rig import Rig
-from hybridve.calib.uncertainty import point_errors
+from hybridve.calib.solving.bundle import Bundle, adjust, view_residuals
+from hybridve.calib.solving.covariance import point_errors
 
 NOISE_PX = 0.3
 N_SEEDS = 14

@@ -12,13 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.calib.bundle import BundleView
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import project_points
-from hybridve.calib.pose import Pose, compose, invert, transform
-from hybridve.calib.target import Chessboard
-from hybridve.calib.world import (
+from hybridve.calib.placing.world import (
     Mark,
     Placed,
     SeenBoards,
@@ -28,6 +26,8 @@ from hybridve.calib.world import (
     place_world,
     triangulate,
 )
+from hybridve.calib.pose import Pose, compose, invert, transform
+from hybridve.calib.solving.bundle import BundleView
 
 EXACT_M = 1e-8
 

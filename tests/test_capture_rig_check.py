@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from helpers.boards import floor_of_noise, look_at, make_camera, render_board, turned_about
 
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.rigs import read_rig, write_rig
 from hybridve.calib.pose import compose, rotation_about_axes
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import read_rig, write_rig
-from hybridve.calib.target import Chessboard
 from hybridve.cli.calibrate import NOT_GOOD_ENOUGH
 from hybridve.hull.capture import rig_check
 from hybridve.hull.capture.rig import load_rig

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
+from hybridve.calib.formats.rigs import read_rig
 from hybridve.calib.pose import angle_between, compose, invert
-from hybridve.calib.rig_io import read_rig
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
-from hybridve.hull.capture.synth import read_truth, true_masks
 from hybridve.hull.report.read import read_report
+from hybridve.hull.synth import read_truth, true_masks
 
 Run = Callable[..., int]
 

@@ -15,11 +15,11 @@ from helpers.boards import board_poses, look_at, make_camera, render_board
 from helpers.recorded_boards import held_up
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Detection, Effort
+from hybridve.calib.boards.board import Detection, Effort
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
+from hybridve.calib.formats.rigs import read_rig
 from hybridve.calib.pose import compose
-from hybridve.calib.rig_io import read_rig
-from hybridve.calib.target import Chessboard
 from hybridve.cli.calibrate import NOT_GOOD_ENOUGH, calibrate
 
 Run = Callable[..., int]

@@ -9,9 +9,9 @@ from click.testing import CliRunner, Result
 from helpers.boards import look_at, make_camera
 
 from hybridve.calib.errors import HybridveError
+from hybridve.calib.formats.rigs import FORMATS, read_any_rig, read_rig, write_rig
 from hybridve.calib.lens import project_points
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import FORMATS, read_any_rig, read_rig, write_rig
 from hybridve.cli.convert import FormatName
 from hybridve.cli.main import cli
 

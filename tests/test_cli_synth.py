@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.session import load_session
-from hybridve.hull.capture.synth import PRESETS, read_truth
-from hybridve.hull.contact.scene import load_scene
+from hybridve.hull.synth import PRESETS, read_truth
 
 Run = Callable[..., int]
 
@@ -18,7 +18,7 @@ def synth(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     from click.testing import CliRunner
 
     from hybridve.cli.main import cli
-    from hybridve.hull.capture.synth import write
+    from hybridve.hull.synth import write
 
     def generate(preset: str, *options: object) -> Path:
         folder = tmp_path_factory.mktemp("synth") / preset

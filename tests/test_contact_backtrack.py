@@ -9,6 +9,7 @@ from helpers.contacts import FREE, contact_at, points_of
 from helpers.hulls import ball_hull, ball_masks, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.backtrack import (
     FirstContact,
     _patch,
@@ -23,7 +24,6 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
-from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points

@@ -5,13 +5,13 @@ import pytest
 from helpers.hulls import ball_masks, look_at, projection, ring_views
 from numpy.typing import NDArray
 
-from hybridve.hull.capture.synth.meshes import box_mesh
+from hybridve.hull.cad.distance import SurfaceDistance
 from hybridve.hull.contact.clearance import ClearanceMeter
-from hybridve.hull.contact.distance import SurfaceDistance
 from hybridve.hull.contact.lattice import Best, DistanceLattice, bound_cells
 from hybridve.hull.query.cells import make_cell_frame
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
+from hybridve.hull.synth.meshes import box_mesh
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.hulls import ball_hull, look_at, projection, ring_views, sphere_mesh
 
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.detect import Body, certify_contacts, detect_contacts, make_body
-from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Hits, Triangles
 from hybridve.hull.query.native import Native

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.hull.capture.synth.meshes import box_mesh
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import Contact, detect_contacts, make_body
 from hybridve.hull.contact.patches import contact_patches
 from hybridve.hull.contact.recovery import recover
 from hybridve.hull.contact.respond import collision_point
-from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.reference import Reference, contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
+from hybridve.hull.synth.meshes import box_mesh
 
 CENTERS = np.array([[-0.3, 0.0, 0.0], [0.3, 0.05, 0.0]])
 RADII_M = (0.06, 0.05)

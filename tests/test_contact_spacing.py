@@ -5,7 +5,6 @@ import pytest
 from helpers.hulls import ball_hull, ring_views
 from numpy.typing import NDArray
 
-from hybridve.hull.capture.synth.meshes import box_mesh
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.spacing import (
     METER_SHARE,
@@ -18,6 +17,7 @@ from hybridve.hull.contact.spacing import (
 )
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.synth.meshes import box_mesh
 
 RADIUS_M = 0.2
 

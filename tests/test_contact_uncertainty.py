@@ -11,9 +11,9 @@ from helpers.hulls import ball_hull, ball_masks, ring_views
 from numpy.typing import NDArray
 from scipy.stats import binom, norm
 
-from hybridve.calib.bundle import moved_pose
 from hybridve.calib.camera import Camera
 from hybridve.calib.rig import Rig, RigCovariance
+from hybridve.calib.solving.bundle import moved_pose
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.uncertainty import (

@@ -14,11 +14,11 @@ from helpers.sessions import BALL_RADIUS_M, write_ball_session, write_cube_scene
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
 from hybridve.hull.contact.respond import ResponseSettings
-from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import Chain, EvaluateSettings, evaluate, make_chain
 from hybridve.hull.query.engine import Engine

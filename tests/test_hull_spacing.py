@@ -10,9 +10,9 @@ import pytest
 from helpers.sessions import write_ball_session, write_cube_scene
 
 from hybridve.calib.errors import ReportError, SceneError, SessionError
+from hybridve.hull.cad.scene import Scene, load_scene
 from hybridve.hull.capture.recording import FrameRange, silhouettes_of
 from hybridve.hull.capture.session import load_session
-from hybridve.hull.contact.scene import Scene, load_scene
 from hybridve.hull.contact.spacing import Move, covers, union
 from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import Chain, EvaluateSettings, make_chain

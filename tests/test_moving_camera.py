@@ -16,15 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Sighting
+from hybridve.calib.boards.board import Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError, SessionError
-from hybridve.calib.hand_eye import mount_camera
+from hybridve.calib.formats.rigs import read_rig, write_rig
 from hybridve.calib.lens import img_from_cam
+from hybridve.calib.placing.hand_eye import mount_camera
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.rig import POSE_PARAMETERS, Mount, Rig, RigCovariance
-from hybridve.calib.rig_io import read_rig, write_rig
-from hybridve.calib.target import Chessboard
+from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import stored_silhouettes
 from hybridve.hull.capture.rig import rig_digest
 from hybridve.hull.capture.session import load_session
@@ -32,7 +33,6 @@ from hybridve.hull.contact.backtrack import first_contact, interpolated_hull
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import detect_contacts
 from hybridve.hull.contact.respond import ResponseSettings
-from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.contact.spacing import Move
 from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
 from hybridve.hull.evaluate import (

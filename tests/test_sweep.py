@@ -23,7 +23,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import DeviceError, ReportError
-from hybridve.hull.contact.scene import SceneObject
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.query import stencil
 from hybridve.hull.query.engine import Engine, Hits, Triangles
 from hybridve.hull.query.reference import Reference, contains_points

@@ -19,8 +19,10 @@ from matplotlib.patches import Rectangle
 from matplotlib.quiver import Quiver
 from numpy.typing import NDArray
 
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.certificate import (
+from hybridve.calib.errors import ReportError
+from hybridve.calib.judging.certificate import (
     Certificate,
     SeenPoints,
     Volume,
@@ -28,11 +30,9 @@ from hybridve.calib.certificate import (
     coverage,
     working_volume,
 )
-from hybridve.calib.errors import ReportError
 from hybridve.calib.lens import cam_from_img, parameter_names, project_points
 from hybridve.calib.rig import POSE_PARAMETERS, Rig, RigCovariance
-from hybridve.calib.target import Chessboard
-from hybridve.calib.uncertainty import Noise, point_errors
+from hybridve.calib.solving.covariance import Noise, point_errors
 from hybridve.hull.view.certificate_charts import (
     CELLS,
     binned_means,

@@ -1,1 +1,1 @@
-"""Rigs in the files of other programs, one format a module, read and written."""
+"""Rigs in files, ours and those of other programs, one format a module, read and written."""

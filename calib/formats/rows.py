@@ -102,7 +102,7 @@ def _decompose(name: str, img_from_world: NDArray[np.float64], where: str) -> Fo
     A projection matrix is known up to a factor, which may be negative. It is chosen so that
     depths are positive in front of the camera: its left part has a positive determinant if the
     image is not mirrored. Whether it is cannot be told from the matrix alone: mirrored, it would
-    look the other way, which the rig's other cameras tell (`hybridve.calib.rig_io`).
+    look the other way, which the rig's other cameras tell (`hybridve.calib.formats.rigs`).
 
     References
     ----------

@@ -8,16 +8,16 @@ from itertools import combinations
 
 import numpy as np
 
-from hybridve.calib.account import Calibration
 from hybridve.calib.calibrate import calibrate_rig
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.rigs import import_rig, read_rig, rig_to_dict
+from hybridve.calib.formats.tracker import read_poses
 from hybridve.calib.image_io import FrameSource
+from hybridve.calib.judging.account import Calibration
+from hybridve.calib.judging.twins import find_twins, twins_text
+from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.placing.world import Mark
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import import_rig, read_rig, rig_to_dict
-from hybridve.calib.settings import CalibrationSettings
-from hybridve.calib.tracker_io import read_poses
-from hybridve.calib.twins import find_twins, twins_text
-from hybridve.calib.world import Mark
 from hybridve.hull.capture.recording import recording_of
 from hybridve.hull.capture.rig_check import (
     camera_inputs,

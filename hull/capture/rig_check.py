@@ -21,14 +21,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import hybridve.calib
-from hybridve.calib.board import Board, Observations
-from hybridve.calib.boards import make_board
-from hybridve.calib.check import NotTestableError, RigCheck, check_from_dict, check_rig
-from hybridve.calib.corner_cache import CornerCache
+from hybridve.calib.boards.board import Board, Observations
+from hybridve.calib.boards.named import make_board
 from hybridve.calib.errors import CalibrationError, HybridveError
-from hybridve.calib.observe import CameraInput, find_boards
+from hybridve.calib.formats.rigs import rig_to_dict
+from hybridve.calib.judging.check import NotTestableError, RigCheck, check_from_dict, check_rig
 from hybridve.calib.rig import Rig
-from hybridve.calib.rig_io import rig_to_dict
+from hybridve.calib.seeing.corner_cache import CornerCache
+from hybridve.calib.seeing.observe import CameraInput, find_boards
 from hybridve.hull.capture.session import Session, SessionCamera
 
 _log = logging.getLogger(__name__)

@@ -72,7 +72,7 @@ class TargetTable(_Table):
         return None
 
     def table(self) -> dict[str, Any]:
-        """Return what was said of the board, for `hybridve.calib.boards.make_board`."""
+        """Return what was said of the board, for `hybridve.calib.boards.named.make_board`."""
         return self.model_dump(exclude_none=True)
 
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from hybridve.calib.errors import CalibrationError, SessionError
+from hybridve.calib.formats.tracker import read_poses
 from hybridve.calib.pose import Pose
 from hybridve.calib.rig import Rig
-from hybridve.calib.tracker_io import read_poses
 from hybridve.hull.capture.session import Session
 
 

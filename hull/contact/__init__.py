@@ -1,1 +1,1 @@
-"""CAD objects, and their contacts with the hull."""
+"""Contacts of CAD objects with the hull: where, how near, how deep, how sure."""

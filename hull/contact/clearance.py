@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.distance import SurfaceDistance
+from hybridve.hull.cad.distance import SurfaceDistance
 from hybridve.hull.contact.lattice import (
     FINEST_LEVEL,
     Best,
@@ -184,7 +184,7 @@ class ClearanceMeter:
     tolerance_m : float
         How far apart the two bounds may be, above 0.
     solid_faces : (T, 3) int32, optional
-        What meets in a closed surface; see `hybridve.hull.contact.distance.SurfaceDistance`.
+        What meets in a closed surface; see `hybridve.hull.cad.distance.SurfaceDistance`.
 
     Raises
     ------

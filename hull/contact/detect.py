@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.scene import SceneObject
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.certify import COLLIDING, FREE, Certifier
 from hybridve.hull.query.clusters import spatial_order

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.distance import SurfaceDistance
+from hybridve.hull.cad.distance import SurfaceDistance
 from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.cells import CellFrame, is_inside
 

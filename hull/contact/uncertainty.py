@@ -50,10 +50,10 @@ What moves an outline
 Per camera, in pixels: `OutlineErrors`. Segmentation, undistortion and rounding are independent from
 camera to camera and add up in squares: ``sum (m_per_px[k] * sigma_px[k]) ** 2``. The calibration is
 not: cameras that were placed by one board err together. A rig that knows its covariance
-(`hybridve.calib.uncertainty`) tells that of the images (e_1, .., e_C) of the point x; with n_k the
-outline's outward normal in image k, the clearance errs by ``sum m_per_px[k] n_k . e_k``, whose
-variance follows. Other rigs tell how far they missed the corners of their board, which stands for
-an independent error. The lower bound less 1.645 standard deviations is what the clearance is at
+(`hybridve.calib.solving.covariance`) tells that of the images (e_1, .., e_C) of the point x; with
+n_k the outline's outward normal in image k, the clearance errs by ``sum m_per_px[k] n_k . e_k``,
+whose variance follows. Other rigs tell how far they missed the corners of their board, which stands
+for an independent error. The lower bound less 1.645 standard deviations is what the clearance is at
 least, at 95 % on one side; less more than that where several sets of cones end the hull.
 
 What is not in it: a silhouette that is wrong by more than its outline (a hand cut off, a chair that
@@ -73,7 +73,7 @@ from scipy.optimize import nnls
 
 from hybridve.calib.pose import Pose
 from hybridve.calib.rig import Rig
-from hybridve.calib.uncertainty import undistorted_covariance
+from hybridve.calib.solving.covariance import undistorted_covariance
 from hybridve.hull.contact.bulge import real_upper
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.components import (

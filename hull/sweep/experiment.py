@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import DeviceError
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.detect import Body, collision_points, make_body
-from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.engine import Engine, Hits
 from hybridve.hull.report.sweep_file import EngineSweep, SweepFrames, SweepRows, TruthSettings
 from hybridve.hull.sweep.cost import fit_cost, window_px_read

@@ -24,11 +24,11 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
-from hybridve.calib.certificate import SeenPoints, Volume, image_errors
+from hybridve.calib.judging.certificate import SeenPoints, Volume, image_errors
 from hybridve.calib.lens import cam_from_img
 from hybridve.calib.pose import invert, transform
 from hybridve.calib.rig import Rig
-from hybridve.calib.uncertainty import point_errors
+from hybridve.calib.solving.covariance import point_errors
 
 _INK = "#333333"
 _GREY = "#DDDDDD"
@@ -40,7 +40,8 @@ _ERROR_COLOURS = LinearSegmentedColormap.from_list(
 )
 _BLANK = "#F1F1F1"
 
-#: Cells across and down an image: those in which `hybridve.calib.certificate.coverage` counts.
+#: Cells across and down an image: those in which `hybridve.calib.judging.certificate.coverage`
+#: counts.
 CELLS = (8, 6)
 
 #: More points than this are drawn as means over cells, so that what they have in common shows.

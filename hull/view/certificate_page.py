@@ -17,12 +17,12 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from hybridve.calib.bundle import POSE
-from hybridve.calib.certificate import Certificate, SeenPoints, Volume
 from hybridve.calib.errors import ReportError
+from hybridve.calib.judging.certificate import Certificate, SeenPoints, Volume
 from hybridve.calib.lens import parameter_names
 from hybridve.calib.rig import Rig
-from hybridve.calib.uncertainty import parameter_slices
+from hybridve.calib.solving.bundle import POSE
+from hybridve.calib.solving.covariance import parameter_slices
 from hybridve.hull.view.certificate_charts import draw_camera, draw_errors, draw_rig
 
 #: What a page can say at first sight.

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from helpers.boards import floor_of_noise, observe_exactly, render_board, ring
 
-from hybridve.calib.board import Observations
+from hybridve.calib.boards.board import Observations
+from hybridve.calib.boards.target import Chessboard, detect_corners
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.image_io import open_source
-from hybridve.calib.observe import CameraInput, observe_boards
 from hybridve.calib.pose import compose
-from hybridve.calib.target import Chessboard, detect_corners
+from hybridve.calib.seeing.observe import CameraInput, observe_boards
 
 HORSEMAN = Chessboard(8, 6, 0.115)
 

@@ -24,11 +24,11 @@ import pytest
 from helpers.hulls import ball_masks, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
+from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import calibrate_session
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.contact.clearance import ClearanceMeter
-from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
@@ -196,8 +196,8 @@ def bench_distances(benchmark: Any, recordings: Path, library: str) -> None:
     import igl
     import open3d
 
-    from hybridve.hull.contact.distance import SurfaceDistance
-    from hybridve.hull.contact.mesh import read_cad
+    from hybridve.hull.cad.distance import SurfaceDistance
+    from hybridve.hull.cad.mesh import read_cad
 
     rng = np.random.default_rng(0)
     asked, off_mm = [], {"hybridve": 0.0, "libigl": 0.0, "Open3D": 0.0}

@@ -50,15 +50,15 @@ from helpers.theory import (
     parameter_errors,
 )
 
-from hybridve.calib.board import Observations
-from hybridve.calib.bundle import Bundle, moved_pose
+from hybridve.calib.boards.board import Observations
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.lens_fit import LensSettings, fit_shared_lens, locate_board
-from hybridve.calib.link import link_cameras
+from hybridve.calib.placing.link import link_cameras
 from hybridve.calib.pose import compose, invert, transform
 from hybridve.calib.rig import Rig
+from hybridve.calib.solving.bundle import Bundle, moved_pose
+from hybridve.calib.solving.lens_fit import LensSettings, fit_shared_lens, locate_board
 
 NOISE_PX = 0.3
 N_FRAMES = 60

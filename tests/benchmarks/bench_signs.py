@@ -30,9 +30,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from helpers.exact_geometry import ExactSolid
 
-from hybridve.hull.contact.distance import SurfaceDistance
-from hybridve.hull.contact.mesh import read_cad
-from hybridve.hull.contact.topology import meeting_faces
+from hybridve.hull.cad.distance import SurfaceDistance
+from hybridve.hull.cad.mesh import read_cad
+from hybridve.hull.cad.topology import meeting_faces
 
 _KINDS = (".stl", ".ply", ".obj", ".step", ".stp")
 

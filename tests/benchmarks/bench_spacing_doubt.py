@@ -31,23 +31,23 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from helpers.erring_task import erring_task
 
-from hybridve.calib.bundle import moved_pose
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig
-from hybridve.calib.uncertainty import parameter_slices
+from hybridve.calib.solving.bundle import moved_pose
+from hybridve.calib.solving.covariance import parameter_slices
+from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import undistort_mask
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.session import Session, load_session
-from hybridve.hull.capture.synth.render import make_view, true_silhouette
-from hybridve.hull.capture.synth.truth import SpacingTruth, read_truth
-from hybridve.hull.contact.scene import load_scene
 from hybridve.hull.contact.spacing import Move, blocked_shifts, free_of, union
 from hybridve.hull.contact.spacing_doubt import unsure_shifts
 from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
 from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.silhouettes import make_hull
 from hybridve.hull.spacing import Layout
+from hybridve.hull.synth.render import make_view, true_silhouette
+from hybridve.hull.synth.truth import SpacingTruth, read_truth
 
 #: Frames that need less room than the recording by more than this decide nothing, metres.
 _NEAR_M = 0.012

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from helpers.sessions import write_ball_session, write_cube_scene
 
-from hybridve.calib.rig_io import write_rig
+from hybridve.calib.formats.rigs import write_rig
 from hybridve.hull.capture.rig import calibrate_session
 from hybridve.hull.capture.session import load_session
 

@@ -45,9 +45,9 @@ from helpers.theory import (
 )
 
 from hybridve.calib.calibrate import solve_rig
-from hybridve.calib.lens_fit import LensSettings
-from hybridve.calib.settings import CalibrationSettings
-from hybridve.calib.uncertainty import parameter_slices, point_errors
+from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.solving.covariance import parameter_slices, point_errors
+from hybridve.calib.solving.lens_fit import LensSettings
 
 N_STILLS = 20
 N_FRAMES = 60

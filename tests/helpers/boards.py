@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, img_from_cam
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes, transform
-from hybridve.calib.target import Chessboard
 
 WIDTH_PX, HEIGHT_PX = 640, 480
 

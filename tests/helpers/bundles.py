@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.boards import board_poses, project, ring
-from hybridve.calib.bundle import Bundle, BundleView, moved_pose
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.pose import compose, invert
-from hybridve.calib.target import Chessboard
+from hybridve.calib.solving.bundle import Bundle, BundleView, moved_pose
 
 BOARD = Chessboard(7, 6, 0.1)
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from hybridve.calib.bundle import Bundle
 from hybridve.calib.pose import compose, invert
+from hybridve.calib.solving.bundle import Bundle
 
 pycolmap.logging.minloglevel = 2
 

@@ -18,10 +18,10 @@ from helpers.hard_cases import CASES, ENGINES, MIDDLE, Case, Scene
 from helpers.hulls import DOUBLE_BAND_PX, EDGE_BAND_PX
 from helpers.polytopes import distance_between
 from hybridve.calib.errors import HybridveError
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import Body, Contact, detect_contacts, make_body
 from hybridve.hull.contact.respond import Response, ResponseSettings, collision_point, respond
-from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.certify import COLLIDING, FREE, OPEN, Certifier
 from hybridve.hull.query.compute import Compute
 from hybridve.hull.query.engine import Engine, Hits

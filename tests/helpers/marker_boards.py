@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.boards.markers import AprilGrid, Charuco
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, img_from_cam
-from hybridve.calib.markers import AprilGrid, Charuco
 from hybridve.calib.pose import Pose, invert, transform
 
 #: The first codes of the family 36h11, as Kalibr's generator lists them.

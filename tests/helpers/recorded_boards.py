@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from helpers.boards import look_at, make_camera
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.lens_fit import locate_board
 from hybridve.calib.pose import Pose, compose, invert, transform
-from hybridve.calib.target import Chessboard
+from hybridve.calib.solving.lens_fit import locate_board
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from helpers.boards import board_poses, project, ring
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes, transform
 from hybridve.calib.rig import Rig
-from hybridve.calib.target import Chessboard
-from hybridve.calib.uncertainty import image_derivatives
+from hybridve.calib.solving.covariance import image_derivatives
 
 BOARD = Chessboard(9, 6, 0.1)
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.boards import floor_of_noise, look_at, make_camera, project, render_board
-from hybridve.calib.board import Observations, Sighting
+from hybridve.calib.boards.board import Observations, Sighting
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.pose import compose
 from hybridve.calib.rig import Rig
-from hybridve.calib.target import Chessboard
 
 SIZE_PX = (320, 240)
 

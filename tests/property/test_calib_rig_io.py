@@ -15,10 +15,7 @@ from numpy.typing import NDArray
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.foreign import rotation_vector
-from hybridve.calib.lens import img_from_cam, project_points
-from hybridve.calib.pose import compose, rotation_about_axes
-from hybridve.calib.rig import Mount, Rig, RigCovariance
-from hybridve.calib.rig_io import (
+from hybridve.calib.formats.rigs import (
     FORMATS,
     UNITS_M,
     export_rig,
@@ -28,6 +25,9 @@ from hybridve.calib.rig_io import (
     rig_to_dict,
     write_rig,
 )
+from hybridve.calib.lens import img_from_cam, project_points
+from hybridve.calib.pose import compose, rotation_about_axes
+from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 #: Text with 17 digits gives a projection back to this, in pixels.
 EXACT_PX = 1e-9

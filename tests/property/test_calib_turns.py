@@ -6,8 +6,8 @@ from helpers.turned_rigs import BOARDS, around, turned
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
-from hybridve.calib.check import check_rig
-from hybridve.calib.target import Chessboard
+from hybridve.calib.boards.target import Chessboard
+from hybridve.calib.judging.check import check_rig
 
 
 @settings(max_examples=10)

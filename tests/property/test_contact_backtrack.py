@@ -10,6 +10,7 @@ from hypothesis import Phase, assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.backtrack import (
     approach_speed,
     first_contact,
@@ -17,7 +18,6 @@ from hybridve.hull.contact.backtrack import (
     interpolated_hull,
 )
 from hybridve.hull.contact.detect import certify_contacts, detect_contacts, make_body
-from hybridve.hull.contact.scene import SceneObject
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points

@@ -7,11 +7,11 @@ from helpers.polytopes import depth_in_box, distance_between, rectangle_hull
 from numpy.typing import NDArray
 
 from hybridve.calib.pose import rotation_about_axes
-from hybridve.hull.capture.synth.meshes import box_mesh
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.query.cells import make_cell_frame, split_cells
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
+from hybridve.hull.synth.meshes import box_mesh
 
 #: The exact answers come from solvers that bound their own error; a tenth of the tolerance.
 SOLVER_M = 1e-5

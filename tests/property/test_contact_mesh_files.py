@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
-from hybridve.hull.contact.mesh import CadFile, read_cad
+from hybridve.hull.cad.mesh import CadFile, read_cad
 
 Solid = tuple[NDArray[np.float64], list[list[int]], float, float]
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.pose import rotation_about_axes
-from hybridve.hull.capture.synth.meshes import box_mesh
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.spacing import (
     METER_SHARE,
@@ -21,6 +20,7 @@ from hybridve.hull.contact.spacing import (
     without,
 )
 from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.synth.meshes import box_mesh
 
 #: What solvers and rounding may be off by.
 ROUNDING_M = 1e-8

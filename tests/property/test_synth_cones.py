@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, project_points
 from hybridve.calib.pose import Pose, rotation_about_axes, transform
-from hybridve.hull.capture.synth.cones import RESOLUTION_M, Surface, TrueHull
-from hybridve.hull.capture.synth.meshes import box_mesh
-from hybridve.hull.capture.synth.presets import PRESETS
-from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Cylinder
+from hybridve.hull.synth.cones import RESOLUTION_M, Surface, TrueHull
+from hybridve.hull.synth.meshes import box_mesh
+from hybridve.hull.synth.presets import PRESETS
+from hybridve.hull.synth.shapes import Ball, Box, Capsule, Cylinder
 
 CAMERAS = PRESETS["boxes"].make_stage().cameras
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.calib.pose import Pose, rotation_about_axes, transform
-from hybridve.hull.capture.synth.closest import TOLERANCE_M, closest_on_surface
-from hybridve.hull.capture.synth.meshes import box_mesh
-from hybridve.hull.capture.synth.shapes import (
+from hybridve.hull.synth.closest import TOLERANCE_M, closest_on_surface
+from hybridve.hull.synth.meshes import box_mesh
+from hybridve.hull.synth.shapes import (
     Ball,
     Box,
     Capsule,

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from hybridve.calib.lens import project_points
 from hybridve.calib.pose import Pose, rotation_about_axes, transform
-from hybridve.hull.capture.synth.presets import PRESETS
-from hybridve.hull.capture.synth.render import View, make_view, true_silhouette
-from hybridve.hull.capture.synth.shapes import Ball, Box, Capsule, Cylinder, Shape
+from hybridve.hull.synth.presets import PRESETS
+from hybridve.hull.synth.render import View, make_view, true_silhouette
+from hybridve.hull.synth.shapes import Ball, Box, Capsule, Cylinder, Shape
 
 #: A pixel belongs to a silhouette if its centre does, so its border is known to half a pixel, or
 #: 0.71 px across the corner; the polygon through projected points falls short by less than 0.1 px.

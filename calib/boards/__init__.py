@@ -1,0 +1,1 @@
+"""Calibration targets: what they are, and how corners are told as files."""

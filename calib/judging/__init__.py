@@ -1,0 +1,1 @@
+"""Whether a rig can be trusted: checks, comparisons, certificates."""

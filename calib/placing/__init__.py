@@ -1,0 +1,1 @@
+"""Where the cameras of a session stand: chains of pictures, clocks, worlds."""

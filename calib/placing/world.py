@@ -1,0 +1,558 @@
+"""Where the world is: from a board, from named points, or from the floor.
+
+Cameras and boards are given in a frame of the rig; what comes back is the motion into the world,
+metres, Z up. A rig stands above its floor: a camera under it means that something is mirrored, and
+is refused.
+
+This work is based on: Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., 2003, chapter 12
+(triangulation); Umeyama, *Least-squares estimation of transformation parameters between two point
+patterns*, IEEE Trans. PAMI 13(4), 1991.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.boards.board import Board
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.lens import cam_from_img
+from hybridve.calib.pose import Pose, compose, invert, transform
+from hybridve.calib.solving.bundle import BundleView
+
+#: The rig's scale by the named points: what is worth a warning, and what no measurement explains.
+SCALE_WARNING = 0.02
+_SCALE_REFUSED = 0.2
+
+#: Points whose second extent is less than this share of the first lie on a line; if the third is,
+#: they lie in a plane, where a mirror image is a turn.
+_LINE = 1e-2
+_FLAT = 2e-2
+
+#: Points that fit worse than this share of their extent are looked at for exchanged names; an
+#: explanation must fit better by this factor.
+_POOR_FIT = 0.02
+_EXPLAINS_FACTOR = 5.0
+
+#: A click that misses its point by more than this share of the image's width is worth a warning.
+_CLICK_SHARE = 0.01
+
+#: Rays that meet at a smaller angle (radians) tell no distance.
+_MIN_ANGLE_RAD = 5e-3
+
+_TRIANGULATION_STEPS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mark:
+    """A point of the scene, clicked in several cameras.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    pixels : mapping of str to (x, y)
+        By camera, pixel centre at 0.5.
+    xyz_m : (3,) float64, or None
+        Where it is in the world, metres.
+    is_floor : bool
+        Whether it lies on the floor.
+    """
+
+    name: str
+    pixels: Mapping[str, tuple[float, float]]
+    xyz_m: NDArray[np.float64] | None = None
+    is_floor: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """The world, and how it was found.
+
+    Attributes
+    ----------
+    world_from_rig : (3, 4) float64
+        Metres.
+    diagnostics : dict
+        Plain JSON values: "kind", "text", "warnings", and what the kind tells (residuals in mm).
+    """
+
+    world_from_rig: Pose
+    diagnostics: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenBoards:
+    """Boards as they were seen, in the rig's frame (what an adjustment gives).
+
+    Attributes
+    ----------
+    boards : sequence of Board
+        The boards.
+    body_from_board, rig_from_body : sequence of (3, 4) float64
+        Where boards sit on their bodies, and where bodies were.
+    pose_names : sequence of (int or str, str)
+        Of each of `rig_from_body` the instant of the clip (or the still's name), and the body.
+    views : sequence of BundleView
+        What was seen.
+    """
+
+    boards: Sequence[Board]
+    body_from_board: Sequence[Pose]
+    rig_from_body: Sequence[Pose]
+    pose_names: Sequence[tuple[int | str, str]]
+    views: Sequence[BundleView]
+
+    def rig_from_board(self, pose: int, board: int) -> Pose:
+        """Return where a board was."""
+        return compose(self.rig_from_body[pose], self.body_from_board[board])
+
+    def main(self) -> tuple[int, int, frozenset[int]]:
+        """Return the pose and board that most cameras see, the earliest of these; and who does.
+
+        Boards of the clip go before those of stills; of several boards the first
+        of `boards` counts (a calibration gives them in order of name).
+        """
+        seeing: dict[tuple[int, int], set[int]] = {}
+        for view in self.views:
+            seeing.setdefault((view.pose, view.board), set()).add(view.camera)
+
+        def rank(key: tuple[int, int]) -> tuple[bool, int, int, int, int]:
+            instant = self.pose_names[key[0]][0]
+            is_still = isinstance(instant, str)
+            return (is_still, -len(seeing[key]), 0 if is_still else int(instant), key[1], key[0])
+
+        if not seeing:
+            raise CalibrationError("no view of a board is left to place the world by")
+        pose, board = min(seeing, key=rank)
+        return pose, board, frozenset(seeing[pose, board])
+
+
+def place_world(
+    kind: str, cameras: Sequence[Camera], seen: SeenBoards, marks: Sequence[Mark] = ()
+) -> Placed:
+    """Place the world as a session's ``world`` says.
+
+    Parameters
+    ----------
+    kind : {"board", "points", "floor"}
+        How.
+    cameras : sequence of Camera
+        Their "world" is the rig's frame.
+    seen : SeenBoards
+        The boards, in that frame.
+    marks : sequence of Mark
+        Points of the scene, for "points" and "floor".
+
+    Raises
+    ------
+    CalibrationError
+        Naming what does not fit: points, or cameras that came out under the floor.
+    """
+    if kind == "points":
+        return place_by_points(cameras, [mark for mark in marks if mark.xyz_m is not None])
+    if kind == "floor":
+        return place_on_floor(cameras, seen, [mark for mark in marks if mark.is_floor])
+    if kind == "board":
+        return place_by_board(cameras, seen)
+    raise ValueError(f"unknown kind of world {kind!r}")
+
+
+def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
+    """Let the world be the board in the first of the instants that most cameras see.
+
+    Raises
+    ------
+    CalibrationError
+        If a camera that sees it came out behind it.
+    """
+    pose, board, seeing = seen.main()
+    world_from_rig = invert(seen.rig_from_board(pose, board))
+    instant, _ = seen.pose_names[pose]
+    n_instants = len({name for name, _ in seen.pose_names if isinstance(name, int)})
+    is_still = n_instants == 1 and isinstance(instant, int)
+    heights = _heights(cameras, world_from_rig)
+    below = [index for index in range(len(cameras)) if heights[index] <= 0]
+    wrong = [index for index in below if index in seeing]
+    if wrong:
+        raise _under_floor(
+            [cameras[index] for index in wrong],
+            [heights[index] for index in wrong],
+            "is its picture mirrored, or did it see another board?",
+        )
+    warnings = [
+        f"camera {cameras[index].name!r} stands {-heights[index]:.2f} m behind the plane of the "
+        "board that is the world: wrong, if this board lies on the floor"
+        for index in below
+    ]
+    text = (
+        "the board as it lies in the clip"
+        if is_still
+        else f"the board in {f'frame {instant}' if isinstance(instant, int) else instant}"
+    )
+    return Placed(
+        world_from_rig,
+        {
+            "kind": "board",
+            "text": text,
+            "board": str(seen.boards[board]),
+            "instant": instant,
+            "cameras": sorted(cameras[index].name for index in seeing),
+            "warnings": warnings,
+        },
+    )
+
+
+def place_by_points(cameras: Sequence[Camera], marks: Sequence[Mark]) -> Placed:
+    """Place the world by points whose places in it are known: rotation and shift, no scale.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Their "world" is the rig's frame.
+    marks : sequence of Mark
+        At least three, not on a line, each with `Mark.xyz_m` and clicked in two cameras or more.
+
+    Raises
+    ------
+    CalibrationError
+        If there are too few points, they lie on a line, their names are exchanged, they are
+        mirrored, their distances contradict the rig's scale, or cameras come out under the floor.
+    """
+    points_rig, misses_px = _triangulated(cameras, marks)
+    if len(marks) < 3:
+        raise CalibrationError(
+            f"the world needs 3 named points or more, found {len(marks)}: "
+            f"{', '.join(mark.name for mark in marks) or 'none'}"
+        )
+    points_world = np.array([mark.xyz_m for mark in marks], np.float64)
+    extents = _extents(points_world)
+    if extents[1] < _LINE * extents[0]:
+        raise CalibrationError(
+            "the points that name the world lie on a line, about which it could turn; add one "
+            "beside it"
+        )
+    size_m = float(extents[0]) / np.sqrt(len(marks))
+    scale = _scale(points_rig, points_world)
+    _, error_m = _rigid_fit(points_rig / scale, points_world)
+    if error_m > _POOR_FIT * size_m:
+        _explain_poor_fit(marks, points_rig / scale, points_world, error_m)
+    if abs(scale - 1.0) > _SCALE_REFUSED:
+        raise CalibrationError(
+            f"the named points are {scale:.3f} times as far apart in the rig as their xyz says; "
+            "is xyz in millimetres, and is the board's square given rightly?"
+        )
+    world_from_rig, _ = _rigid_fit(points_rig, points_world)
+    residuals_mm = 1000.0 * np.linalg.norm(
+        transform(world_from_rig, points_rig) - points_world, axis=1
+    )
+    heights = _heights(cameras, world_from_rig)
+    wrong = [index for index in range(len(cameras)) if heights[index] <= 0]
+    if wrong:
+        cause = (
+            "all of them: does z of the points run downwards, or are they listed mirrored?"
+            if len(wrong) == len(cameras)
+            else "is its picture mirrored, or does the world's z = 0 lie above it?"
+        )
+        raise _under_floor(
+            [cameras[index] for index in wrong], [heights[index] for index in wrong], cause
+        )
+    warnings = _click_warnings(cameras, marks, misses_px)
+    if abs(scale - 1.0) > SCALE_WARNING:
+        warnings.append(
+            f"the named points are {scale:.3f} times as far apart in the rig as their xyz says: "
+            "one of the points' distances and the board's square was measured wrongly"
+        )
+    return Placed(
+        world_from_rig,
+        {
+            "kind": "points",
+            "text": f"{len(marks)} named points",
+            "residuals_mm": {
+                mark.name: round(float(residual), 3)
+                for mark, residual in zip(marks, residuals_mm, strict=True)
+            },
+            "scale": round(scale, 5),
+            "misses_px": _rounded(misses_px),
+            "warnings": warnings,
+        },
+    )
+
+
+def place_on_floor(
+    cameras: Sequence[Camera], seen: SeenBoards, marks: Sequence[Mark] = ()
+) -> Placed:
+    """Fit the floor: Z up, towards the cameras; X along the board's, laid onto the floor.
+
+    The origin is the foot of the middle of the board that `place_by_board` would take. The floor
+    runs through the marks, or, where there are none, through the boards of a clip in which they lie
+    still.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Their "world" is the rig's frame.
+    seen : SeenBoards
+        The boards, in that frame.
+    marks : sequence of Mark
+        Points of the floor, three or more, not on a line; or none.
+
+    Raises
+    ------
+    CalibrationError
+        If the points do not tell a plane, or cameras are on both sides of it.
+    """
+    misses_px: dict[str, dict[str, float]] = {}
+    if marks:
+        floor_rig, misses_px = _triangulated(cameras, marks)
+        names = [mark.name for mark in marks]
+    else:
+        floor_rig, names = _still_corners(seen)
+    if len(floor_rig) < 3:
+        raise CalibrationError(
+            f"the floor needs 3 points or more, found {len(floor_rig)}: {', '.join(names)}"
+        )
+    middle = floor_rig.mean(axis=0)
+    extents = _extents(floor_rig)
+    if extents[1] < _LINE * extents[0]:
+        raise CalibrationError(
+            f"the points of the floor ({', '.join(names)}) lie on a line, about which the floor "
+            "could turn; add one beside it"
+        )
+    up = np.linalg.svd(floor_rig - middle)[2][2]
+    centers = np.array([camera.center_world for camera in cameras])
+    heights = (centers - middle) @ up
+    if (heights < 0).sum() > len(cameras) / 2:
+        up, heights = -up, -heights
+    if (heights <= 0).any():
+        wrong = np.flatnonzero(heights <= 0).tolist()
+        raise _under_floor(
+            [cameras[index] for index in wrong],
+            [float(heights[index]) for index in wrong],
+            "is its picture mirrored, or is a point of the floor clicked wrongly?",
+        )
+    pose, board, _ = seen.main()
+    rig_from_board = seen.rig_from_board(pose, board)
+    along = rig_from_board[:, 0]
+    if np.linalg.norm(along - (along @ up) * up) < 0.1:  # the board's x stands upright
+        along = rig_from_board[:, 1]
+    x = along - (along @ up) * up
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(up, x), up])
+    foot = transform(rig_from_board, seen.boards[board].center_board[None])[0]
+    foot = foot - ((foot - middle) @ up) * up
+    offsets_mm = 1000.0 * (floor_rig - middle) @ up
+    told = (
+        {name: round(float(offset), 3) for name, offset in zip(names, offsets_mm, strict=True)}
+        if marks
+        else {"boards, rms": round(float(np.sqrt((offsets_mm**2).mean())), 3)}
+    )
+    return Placed(
+        np.column_stack([rotation, -rotation @ foot]),
+        {
+            "kind": "floor",
+            "text": f"the floor through {len(names) if marks else 'the boards on it'}"
+            + (" points" if marks else ""),
+            "residuals_mm": told,
+            "misses_px": _rounded(misses_px),
+            "warnings": _click_warnings(cameras, marks, misses_px),
+        },
+    )
+
+
+def triangulate(
+    cameras: Sequence[Camera], pixels: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the point that several cameras see, with the least squared error in their images.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        At least two.
+    pixels : (C, 2) float64
+        Where each sees it, pixel centre at 0.5.
+
+    Returns
+    -------
+    point_world : (3,) float64
+        NaN where a camera has no ray there, the rays are as good as parallel, or meet behind a
+        camera.
+    misses_px : (C,) float64
+        By how far each camera misses it.
+    """
+    nowhere = np.full(3, np.nan), np.full(len(cameras), np.nan)
+    rays = np.stack([cam_from_img(camera, pixels[i, None])[0] for i, camera in enumerate(cameras)])
+    if not np.isfinite(rays).all():
+        return nowhere
+    focal_px = np.array([camera.pinhole[0, 0] for camera in cameras])
+    poses = np.stack([camera.cam_from_world for camera in cameras])
+    directions = np.einsum(
+        "cji,cj->ci", poses[:, :, :3], np.column_stack([rays, np.ones(len(rays))])
+    )
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    spread = np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=2)
+    if spread.max() < _MIN_ANGLE_RAD:
+        return nowhere
+    # Start where the rays pass nearest to one another, in space.
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    centers = np.array([camera.center_world for camera in cameras])
+    point = np.linalg.solve(across.sum(axis=0), np.einsum("cij,cj->i", across, centers))
+    residuals = np.zeros((len(cameras), 2))
+    for _ in range(_TRIANGULATION_STEPS):
+        points_cam = poses[:, :, :3] @ point + poses[:, :, 3]
+        if (points_cam[:, 2] <= 0).any():
+            return nowhere
+        flat = points_cam[:, :2] / points_cam[:, 2:]
+        residuals = focal_px[:, None] * (rays - flat)
+        slopes = (poses[:, :2, :3] - flat[:, :, None] * poses[:, 2:, :3]) / points_cam[:, 2:, None]
+        jacobian = (focal_px[:, None, None] * slopes).reshape(-1, 3)
+        point = point + np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
+    return np.asarray(point), np.linalg.norm(residuals, axis=1)
+
+
+def _triangulated(
+    cameras: Sequence[Camera], marks: Sequence[Mark]
+) -> tuple[NDArray[np.float64], dict[str, dict[str, float]]]:
+    """Return the marks' places (M, 3) in the rig, and by mark and camera how far it is missed."""
+    by_name = {camera.name: camera for camera in cameras}
+    points = np.zeros((len(marks), 3))
+    misses: dict[str, dict[str, float]] = {}
+    for index, mark in enumerate(marks):
+        names = sorted(name for name in mark.pixels if name in by_name)
+        if len(names) < 2:
+            raise CalibrationError(
+                f"point {mark.name!r} is seen by {len(names)} camera of the rig; mark it in 2 or "
+                "more"
+            )
+        pixels = np.array([mark.pixels[name] for name in names], np.float64)
+        points[index], missed_px = triangulate([by_name[name] for name in names], pixels)
+        if not np.isfinite(points[index]).all():
+            raise CalibrationError(
+                f"point {mark.name!r}: the rays of {', '.join(map(repr, names))} do not meet "
+                "before them; is it clicked at the same place in each picture, and are the cameras "
+                "far enough apart?"
+            )
+        misses[mark.name] = dict(zip(names, map(float, missed_px), strict=True))
+    return points, misses
+
+
+def _still_corners(seen: SeenBoards) -> tuple[NDArray[np.float64], list[str]]:
+    instants = {name for name, _ in seen.pose_names if isinstance(name, int)}
+    if len(instants) != 1:
+        raise CalibrationError(
+            "the floor cannot be told: no point of it is named ([[point]] with floor = true), and "
+            "the boards do not lie still in the clip"
+        )
+    lying = sorted(
+        {
+            (view.pose, view.board)
+            for view in seen.views
+            if isinstance(seen.pose_names[view.pose][0], int)
+        }
+    )
+    corners = [
+        transform(seen.rig_from_board(pose, board), seen.boards[board].points_board)
+        for pose, board in lying
+    ]
+    return np.concatenate(corners), [str(seen.boards[board]) for _, board in lying]
+
+
+def _extents(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the singular values (3,) of points about their middle, largest first."""
+    values = np.zeros(3)
+    found = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    values[: len(found)] = found
+    return values
+
+
+def _scale(points_rig: NDArray[np.float64], points_world: NDArray[np.float64]) -> float:
+    """Return how many times as far apart points are in the rig as in the world."""
+    in_rig = np.linalg.norm(points_rig - points_rig.mean(axis=0))
+    return float(in_rig / np.linalg.norm(points_world - points_world.mean(axis=0)))
+
+
+def _rigid_fit(
+    points_rig: NDArray[np.float64], points_world: NDArray[np.float64], is_mirrored: bool = False
+) -> tuple[Pose, float]:
+    """Return world_from_rig (with a mirror, if asked for), and the rms distance that is left."""
+    middle_rig, middle_world = points_rig.mean(axis=0), points_world.mean(axis=0)
+    u, _, vt = np.linalg.svd((points_world - middle_world).T @ (points_rig - middle_rig))
+    handed = np.sign(np.linalg.det(u @ vt)) * (-1.0 if is_mirrored else 1.0)
+    rotation = u @ np.diag([1.0, 1.0, handed]) @ vt
+    pose = np.column_stack([rotation, middle_world - rotation @ middle_rig])
+    left = transform(pose, points_rig) - points_world
+    return pose, float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def _explain_poor_fit(
+    marks: Sequence[Mark],
+    points_rig: NDArray[np.float64],
+    points_world: NDArray[np.float64],
+    error_m: float,
+) -> None:
+    """Refuse points that fit far better mirrored, or with two names exchanged."""
+    extents = _extents(points_world)
+    _, mirrored_m = _rigid_fit(points_rig, points_world, is_mirrored=True)
+    if extents[2] > _FLAT * extents[0] and mirrored_m < error_m / _EXPLAINS_FACTOR:
+        raise CalibrationError(
+            f"the named points are a mirror image of those in the rig: they fit to "
+            f"{1000 * error_m:.0f} mm as they are, to {1000 * mirrored_m:.1f} mm mirrored; x, y "
+            "and z must be right-handed (check a sign, or the order of x and y)"
+        )
+    if len(marks) < 4:
+        return  # three points always fit some exchange about as well
+    for one, other in combinations(range(len(marks)), 2):
+        order = np.arange(len(marks))
+        order[[one, other]] = other, one
+        _, exchanged_m = _rigid_fit(points_rig[order], points_world)
+        if exchanged_m < error_m / _EXPLAINS_FACTOR:
+            raise CalibrationError(
+                f"points {marks[one].name!r} and {marks[other].name!r} seem to be exchanged: the "
+                f"named points fit to {1000 * error_m:.0f} mm as they are, to "
+                f"{1000 * exchanged_m:.1f} mm with these two exchanged"
+            )
+
+
+def _heights(cameras: Sequence[Camera], world_from_rig: Pose) -> list[float]:
+    centers = np.array([camera.center_world for camera in cameras])
+    return [float(height) for height in transform(world_from_rig, centers)[:, 2]]
+
+
+def _under_floor(
+    cameras: Sequence[Camera], heights_m: Sequence[float], cause: str
+) -> CalibrationError:
+    told = ", ".join(
+        f"{camera.name!r} ({-height:.2f} m)"
+        for camera, height in zip(cameras, heights_m, strict=True)
+    )
+    plural = "s" if len(cameras) > 1 else ""
+    return CalibrationError(f"camera{plural} {told} came out under the floor: {cause}")
+
+
+def _click_warnings(
+    cameras: Sequence[Camera],
+    marks: Sequence[Mark],
+    misses_px: Mapping[str, Mapping[str, float]],
+) -> list[str]:
+    widths = {camera.name: camera.width_px for camera in cameras}
+    warnings = []
+    for mark in marks:
+        missed = misses_px[mark.name]
+        worst = max(missed, key=lambda name: missed[name] / widths[name])
+        if missed[worst] > _CLICK_SHARE * widths[worst]:
+            warnings.append(
+                f"point {mark.name!r}: the rays of {', '.join(map(repr, sorted(missed)))} miss one "
+                f"another by {missed[worst]:.1f} px (in {worst!r}); is it the same place in each?"
+            )
+    return warnings
+
+
+def _rounded(misses_px: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    return {
+        point: {camera: round(missed, 2) for camera, missed in missed_px.items()}
+        for point, missed_px in misses_px.items()
+    }

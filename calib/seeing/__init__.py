@@ -1,0 +1,1 @@
+"""From pictures to observations: where each camera sees which point of a target."""

@@ -1,0 +1,1 @@
+"""From observations to lenses and poses: adjustments, their weights and their covariance."""

@@ -1,0 +1,574 @@
+"""The joint adjustment of a rig: lenses, cameras, boards and their bodies, all at once.
+
+A board point goes through four frames: board, body (boards that are mounted together), rig (the
+frame in which one body pose is held), camera; then through the lens::
+
+    pixel = lens_c( cam_from_rig_c  rig_from_body_p  body_from_board_b  point )
+
+The lens models are COLMAP's. The poses of the bodies, of which there are hundreds, are eliminated
+(Schur complement), so that each step solves for the cameras alone; what is left of the normal
+matrix is the information that the pictures hold about the cameras, from which their covariance
+follows (`hybridve.calib.solving.covariance`). COLMAP's own adjustment has no boards mounted
+together, no lens common to several cameras of a rig, and gives no covariance of a rig.
+
+A pose T is adjusted as exp(xi) T with xi = (omega, v) in the frame it leads to:
+``x_true = x + omega x x + v``, radians and metres.
+
+This work is based on: Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle adjustment: a modern
+synthesis*, 2000; Nocedal and Wright, *Numerical optimization*, 2nd ed., 2006, chapter 10
+(Levenberg and Marquardt); Barfoot, *State estimation for robotics*, 2017, chapter 7 (poses).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.boards.board import is_seen
+from hybridve.calib.camera import Camera
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.lens import img_by_params, img_from_cam
+from hybridve.calib.pose import Pose, transform
+
+#: Parameters of a pose.
+POSE = 6
+
+#: Steps of central differences: of coordinates by depth, and of lens parameters by their size (and
+#: at least by one). Rounding, about 1e-13 px, and curvature both stay below 1e-8 of a derivative.
+_COORDINATE_STEP = 1e-6
+_PARAMETER_STEP = 1e-6
+
+#: The adjustment has converged when a step changes no parameter by more than this share of its
+#: own uncertainty for one pixel of noise, or the cost by less than rounding.
+_STEP_TOLERANCE = 1e-9
+_COST_TOLERANCE = 1e-12
+_COST_FLOOR_PX = 1e-9
+_MAX_STEPS = 100
+
+_FIRST_DAMPING = 1e-4
+_LEAST_DAMPING = 1e-13
+_MOST_DAMPING = 1e12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleView:
+    """One board in one image.
+
+    Attributes
+    ----------
+    camera : int
+        Which camera took it.
+    pose : int
+        Which pose the board's body had then: views of one pose saw it in one place.
+    board : int
+        Which board it is.
+    pixels : (N, 2) float64
+        Its points in pixels, pixel centre at 0.5; NaN where not seen.
+    image : str
+        For messages.
+    sigma_px : float
+        Standard deviation of a coordinate by which its points are weighed.
+    """
+
+    camera: int
+    pose: int
+    board: int
+    pixels: NDArray[np.float64]
+    image: str
+    sigma_px: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """What is to be adjusted, with start values; or what has been.
+
+    Attributes
+    ----------
+    points_board : tuple of (N, 3) float64
+        The points of each board in its own frame, metres; they stay.
+    cameras : tuple of Camera
+        Their "world" is the rig's frame.
+    rig_from_body : tuple of (3, 4) float64
+        One for each pose that a body had.
+    body_from_board : tuple of (3, 4) float64
+        Where each board sits on its body.
+    views : tuple of BundleView
+        What was seen.
+    held_pose : int
+        The pose that stays, and so defines the rig's frame.
+    lens_of : tuple of int
+        By camera the number of its lens; cameras with the same number share one.
+    fixed_lenses : frozenset of int
+        Lenses that stay.
+    held_boards : frozenset of int
+        Boards that stay on their bodies: one of each body at least.
+    """
+
+    points_board: tuple[NDArray[np.float64], ...]
+    cameras: tuple[Camera, ...]
+    rig_from_body: tuple[Pose, ...]
+    body_from_board: tuple[Pose, ...]
+    views: tuple[BundleView, ...]
+    held_pose: int
+    lens_of: tuple[int, ...]
+    fixed_lenses: frozenset[int]
+    held_boards: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """A bundle after its adjustment.
+
+    Attributes
+    ----------
+    bundle : Bundle
+        With the adjusted cameras, boards and poses.
+    residuals_px : tuple of (N, 2) float64
+        Observed minus projected points of each view; NaN where not seen.
+    information : (A, A) float64
+        Of the adjusted parameters of cameras, lenses and boards, for points as noisy as their views
+        say (`BundleView.sigma_px`): the normal matrix without the bodies' poses, in the columns of
+        `layout`.
+    layout : Layout
+        Which column is what.
+    n_steps : int
+        Steps that it took.
+    """
+
+    bundle: Bundle
+    residuals_px: tuple[NDArray[np.float64], ...]
+    information: NDArray[np.float64]
+    layout: "Layout"
+    n_steps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """The columns of the parameters that are adjusted together.
+
+    Attributes
+    ----------
+    of_camera : tuple of slice
+        The pose of each camera, 6 columns.
+    of_lens : dict of int to slice
+        The parameters of each lens that is adjusted.
+    of_board : dict of int to slice
+        The place on its body of each board that is adjusted, 6 columns.
+    size : int
+        How many columns there are.
+    """
+
+    of_camera: tuple[slice, ...]
+    of_lens: dict[int, slice]
+    of_board: dict[int, slice]
+    size: int
+
+
+def make_layout(bundle: Bundle) -> Layout:
+    """Return the columns of a bundle's parameters: cameras, then lenses, then boards."""
+    position = 0
+
+    def take(count: int) -> slice:
+        nonlocal position
+        position += count
+        return slice(position - count, position)
+
+    of_camera = tuple(take(POSE) for _ in bundle.cameras)
+    of_lens: dict[int, slice] = {}
+    for camera, lens in zip(bundle.cameras, bundle.lens_of, strict=True):
+        if lens not in of_lens and lens not in bundle.fixed_lenses:
+            of_lens[lens] = take(len(camera.params))
+    of_board = {
+        board: take(POSE)
+        for board in range(len(bundle.points_board))
+        if board not in bundle.held_boards
+    }
+    return Layout(of_camera, of_lens, of_board, position)
+
+
+def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
+    """Adjust a bundle to the least squares of its residuals.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        Start values; every pose should be seen by some view.
+    loss_px : float
+        Points that miss by more than this many pixels count less than squared (soft L1); infinite
+        for plain least squares.
+
+    Raises
+    ------
+    CalibrationError
+        If the start values project points to nowhere.
+    """
+    layout = make_layout(bundle)
+    groups = _groups(bundle)
+    residuals = _residuals(bundle, groups)
+    n_seen = sum(map(len, residuals))
+    cost = _cost(groups, residuals, loss_px)
+    if not np.isfinite(cost):
+        lost = next(
+            view.image
+            for view, missed in zip(bundle.views, _by_view(bundle, groups, residuals), strict=True)
+            if not np.isfinite(missed[is_seen(view.pixels)]).all()
+        )
+        raise CalibrationError(
+            f"the joint adjustment cannot start: its lens does not see the board in {lost}"
+        )
+    damping = _FIRST_DAMPING
+    normal = _normal_equations(bundle, layout, groups, residuals, loss_px)
+    n_steps = 0
+    while n_steps < _MAX_STEPS and damping < _MOST_DAMPING:
+        n_steps += 1
+        step = _solve(normal, damping)
+        moved = _moved(bundle, layout, step)
+        moved_residuals = _residuals(moved, groups)
+        moved_cost = _cost(groups, moved_residuals, loss_px)
+        is_small = _largest(step, normal) < _STEP_TOLERANCE
+        if moved_cost <= cost:  # False for NaN
+            gain = cost - moved_cost
+            bundle, residuals, cost = moved, moved_residuals, moved_cost
+            damping = max(damping / 10.0, _LEAST_DAMPING)
+            normal = _normal_equations(bundle, layout, groups, residuals, loss_px)
+            if is_small or gain <= _COST_TOLERANCE * cost + n_seen * _COST_FLOOR_PX**2:
+                break
+        elif is_small:
+            break  # as good as rounding allows
+        else:
+            damping *= 10.0
+    return Adjusted(
+        bundle, _by_view(bundle, groups, residuals), _reduced(normal, 0.0)[0], layout, n_steps
+    )
+
+
+def view_residuals(bundle: Bundle) -> tuple[NDArray[np.float64], ...]:
+    """Return observed minus projected points (N, 2) of each view, pixels; NaN where not seen."""
+    groups = _groups(bundle)
+    return _by_view(bundle, groups, _residuals(bundle, groups))
+
+
+# --- Points, many at once ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """All that one camera saw of one board: S points of V views."""
+
+    camera: int
+    board: int
+    poses: NDArray[np.intp]  # (V,) in the bundle
+    view: NDArray[np.intp]  # (S,) of each point its view in the bundle, ...
+    member: NDArray[np.intp]  # (S,) ... and in this group
+    point: NDArray[np.intp]  # (S,) of the board
+    pixels: NDArray[np.float64]  # (S, 2)
+    sigma_px: NDArray[np.float64]  # (S,)
+
+
+def _groups(bundle: Bundle) -> list[_Group]:
+    members: dict[tuple[int, int], list[int]] = {}
+    for number, view in enumerate(bundle.views):
+        members.setdefault((view.camera, view.board), []).append(number)
+    groups = []
+    for (camera, board), numbers in sorted(members.items()):
+        pixels = np.array([bundle.views[number].pixels for number in numbers])  # (V, N, 2)
+        member, point = np.nonzero(np.isfinite(pixels).all(axis=2))
+        groups.append(
+            _Group(
+                camera,
+                board,
+                np.array([bundle.views[number].pose for number in numbers]),
+                np.array(numbers)[member],
+                member,
+                point,
+                pixels[member, point],
+                np.array([bundle.views[number].sigma_px for number in numbers])[member],
+            )
+        )
+    return groups
+
+
+def _by_view(
+    bundle: Bundle, groups: Sequence[_Group], rows: Sequence[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], ...]:
+    """Return rows (S, 2) of what was seen in each group by view (N, 2), NaN elsewhere."""
+    every = tuple(np.full(view.pixels.shape, np.nan) for view in bundle.views)
+    for group, own in zip(groups, rows, strict=True):
+        ends = np.flatnonzero(np.diff(group.member)) + 1
+        for view, point, row in zip(
+            np.split(group.view, ends),
+            np.split(group.point, ends),
+            np.split(own, ends),
+            strict=True,
+        ):
+            if len(view):
+                every[view[0]][point] = row
+    return every
+
+
+def _points_of(
+    bundle: Bundle, group: _Group
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return a group's points (S, 3) in the frames of body, rig and camera."""
+    points_board = bundle.points_board[group.board]
+    points_body = transform(bundle.body_from_board[group.board], points_board)[group.point]
+    rig_from_body = np.array([bundle.rig_from_body[pose] for pose in group.poses])[group.member]
+    points_rig = (rig_from_body[:, :, :3] @ points_body[:, :, None])[..., 0] + rig_from_body[..., 3]
+    return (
+        points_body,
+        points_rig,
+        transform(bundle.cameras[group.camera].cam_from_world, points_rig),
+    )
+
+
+def _residuals(bundle: Bundle, groups: Sequence[_Group]) -> list[NDArray[np.float64]]:
+    """Return observed minus projected points (S, 2) of each group, pixels."""
+    return [
+        group.pixels - img_from_cam(bundle.cameras[group.camera], _points_of(bundle, group)[2])
+        for group in groups
+    ]
+
+
+def _cost(
+    groups: Sequence[_Group], residuals: Sequence[NDArray[np.float64]], loss_px: float
+) -> float:
+    """Return the robust sum of squares, weighed; NaN where a seen point has no image."""
+    squares = (np.concatenate(residuals) ** 2).sum(axis=1)
+    if np.isfinite(loss_px):
+        squares = 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
+    return float(np.concatenate([group.sigma_px**-2.0 for group in groups]) @ squares)
+
+
+# --- One step ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """The normal equations: cameras, lenses and boards (A columns), and poses (F of 6)."""
+
+    rest: NDArray[np.float64]  # (A, A)
+    rest_gradient: NDArray[np.float64]  # (A,)
+    poses: NDArray[np.float64]  # (F, 6, 6)
+    poses_gradient: NDArray[np.float64]  # (F, 6)
+    mixed: NDArray[np.float64]  # (F, 6, A)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    rest: NDArray[np.float64]  # (A,)
+    poses: NDArray[np.float64]  # (F, 6)
+
+
+def _normal_equations(
+    bundle: Bundle,
+    layout: Layout,
+    groups: Sequence[_Group],
+    residuals: Sequence[NDArray[np.float64]],
+    loss_px: float,
+) -> _Normal:
+    n_poses = len(bundle.rig_from_body)
+    normal = _Normal(
+        np.zeros((layout.size, layout.size)),
+        np.zeros(layout.size),
+        np.zeros((n_poses, POSE, POSE)),
+        np.zeros((n_poses, POSE)),
+        np.zeros((n_poses, POSE, layout.size)),
+    )
+    for group, missed in zip(groups, residuals, strict=True):
+        jacobian, columns = _jacobian(bundle, layout, group)
+        weights = 1.0 / group.sigma_px
+        if np.isfinite(loss_px):  # the weights of the soft L1
+            weights = weights * (1.0 + (missed**2).sum(axis=1) / loss_px**2) ** -0.25
+        rows = np.concatenate([jacobian, missed[:, :, None]], axis=2) * weights[:, None, None]
+        gram = _grams(rows, group)  # (V, n + 6 + 1, n + 6 + 1)
+        n = len(columns)
+        of_all = gram.sum(axis=0)
+        normal.rest[np.ix_(columns, columns)] += of_all[:n, :n]
+        normal.rest_gradient[columns] += of_all[:n, -1]
+        for pose, own in zip(group.poses, gram, strict=True):
+            normal.poses[pose] += own[n:-1, n:-1]
+            normal.poses_gradient[pose] += own[n:-1, -1]
+            normal.mixed[pose][:, columns] += own[n:-1, :n]
+    held = bundle.held_pose
+    normal.poses[held], normal.poses_gradient[held], normal.mixed[held] = np.eye(POSE), 0.0, 0.0
+    return normal
+
+
+def _jacobian(
+    bundle: Bundle, layout: Layout, group: _Group
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return the derivatives of a group's pixels by what is adjusted.
+
+    Returns
+    -------
+    jacobian : (S, 2, n + 6) float64
+        By the parameters that all views share, then by the pose of the body in each.
+    columns : (n,) int
+        Which parameters the former are.
+    """
+    camera = bundle.cameras[group.camera]
+    points_body, points_rig, points_cam = _points_of(bundle, group)
+    by_point, by_parameter = lens_derivatives(camera, points_cam)
+    blocks = [_by_pose(by_point, points_cam)]
+    spans = [layout.of_camera[group.camera]]
+    lens = layout.of_lens.get(bundle.lens_of[group.camera])
+    if lens is not None:
+        blocks.append(by_parameter)
+        spans.append(lens)
+    by_point_rig = by_point @ camera.cam_from_world[:, :3]
+    board = layout.of_board.get(group.board)
+    if board is not None:
+        rig_from_body = np.array([bundle.rig_from_body[pose][:, :3] for pose in group.poses])
+        blocks.append(_by_pose(by_point_rig @ rig_from_body[group.member], points_body))
+        spans.append(board)
+    blocks.append(_by_pose(by_point_rig, points_rig))
+    columns = np.concatenate([np.arange(span.start, span.stop) for span in spans])
+    return np.concatenate(blocks, axis=2), columns
+
+
+def _grams(rows: NDArray[np.float64], group: _Group) -> NDArray[np.float64]:
+    """Return for each view of a group the sum of products (V, n, n) of its rows (S, 2, n)."""
+    # Views of fewer points are filled up with rows of zeros: one product for all.
+    n_points = int(group.point.max(initial=0)) + 1
+    filled = np.zeros((len(group.poses), n_points, *rows.shape[1:]))
+    filled[group.member, group.point] = rows
+    filled = filled.reshape(len(filled), -1, rows.shape[2])
+    return np.asarray(filled.transpose(0, 2, 1) @ filled)
+
+
+def _by_pose(by_point: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivatives (S, 2, 6) by omega and v of the pose that led to the points (S, 3)."""
+    # d(omega x X) = -[X] omega, and rows of by_point times -[X] are X cross row.
+    return np.concatenate([np.cross(points[:, None, :], by_point), by_point], axis=2)
+
+
+def lens_derivatives(
+    camera: Camera, points_cam: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the derivatives of a lens by the point and by its parameters.
+
+    Parameters
+    ----------
+    camera : Camera
+        The lens.
+    points_cam : (S, 3) float64
+        Points in front of it, metres.
+
+    Returns
+    -------
+    by_point : (S, 2, 3) float64
+        Pixels a metre.
+    by_parameter : (S, 2, P) float64
+        Pixels a unit of each parameter. Both by central differences, relative error about 1e-9.
+    """
+    steps = _COORDINATE_STEP * np.linalg.norm(points_cam, axis=1)
+    shifts = np.eye(3)[:, None, :] * steps[:, None]  # (3, S, 3)
+    shifted = np.concatenate([points_cam + shifts, points_cam - shifts])  # (6, S, 3)
+    images = img_from_cam(camera, shifted.reshape(-1, 3)).reshape(2, 3, len(points_cam), 2)
+    by_point = ((images[0] - images[1]) / (2.0 * steps[:, None])).transpose(1, 2, 0)
+    sizes = _PARAMETER_STEP * np.maximum(1.0, np.abs(camera.params))
+    ahead, behind = camera.params + np.diag(sizes), camera.params - np.diag(sizes)
+    images = img_by_params(camera, np.concatenate([ahead, behind]), points_cam)
+    images = images.reshape(2, len(sizes), len(points_cam), 2)
+    widths = np.diag(ahead - behind)  # as rounded
+    by_parameter = ((images[0] - images[1]) / widths[:, None, None]).transpose(1, 2, 0)
+    return by_point, by_parameter
+
+
+def _reduced(
+    normal: _Normal, damping: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the normal equations without the poses, and what gives the poses back.
+
+    Each diagonal is raised by a share, `damping`.
+    """
+    n_poses, size = len(normal.poses), len(normal.rest)
+    poses = normal.poses + damping * normal.poses * np.eye(POSE)
+    inverse = np.linalg.inv(poses)  # (F, 6, 6)
+    back = inverse @ normal.mixed  # (F, 6, A)
+    rest = normal.rest + damping * np.diag(np.diag(normal.rest))
+    flat_mixed = normal.mixed.reshape(n_poses * POSE, size)
+    rest = rest - flat_mixed.T @ back.reshape(n_poses * POSE, size)
+    own = np.einsum("fij,fj->fi", inverse, normal.poses_gradient)
+    gradient = normal.rest_gradient - flat_mixed.T @ own.reshape(-1)
+    return (rest + rest.T) / 2.0, gradient, back, own
+
+
+def _solve(normal: _Normal, damping: float) -> _Step:
+    information, gradient, back, own = _reduced(normal, damping)
+    scale = np.sqrt(np.diag(normal.rest))
+    scale[scale == 0] = 1.0  # a parameter without effect stays where it is
+    scaled = information / np.outer(scale, scale)
+    scaled[np.diag_indices_from(scaled)] += np.where(np.diag(normal.rest) == 0, 1.0, 0.0)
+    values, vectors = np.linalg.eigh(scaled)
+    # What rounding leaves of a direction that the data do not tell is not walked along.
+    known = values > _LEAST_DAMPING * values[-1]
+    rest = vectors[:, known] @ ((vectors[:, known].T @ (gradient / scale)) / values[known]) / scale
+    return _Step(rest, own - back @ rest)
+
+
+def _largest(step: _Step, normal: _Normal) -> float:
+    """Return the largest entry of a step, by its effect on the root of the sum of squares (px)."""
+    of_rest = np.abs(step.rest) * np.sqrt(np.diag(normal.rest))
+    of_poses = np.abs(step.poses) * np.sqrt(np.einsum("fii->fi", normal.poses))
+    return float(max(of_rest.max(initial=0.0), of_poses.max(initial=0.0)))
+
+
+def _moved(bundle: Bundle, layout: Layout, step: _Step) -> Bundle:
+    cameras = []
+    for index, camera in enumerate(bundle.cameras):
+        lens = layout.of_lens.get(bundle.lens_of[index])
+        cameras.append(
+            replace(
+                camera,
+                params=camera.params if lens is None else camera.params + step.rest[lens],
+                cam_from_world=moved_pose(
+                    camera.cam_from_world, step.rest[layout.of_camera[index]]
+                ),
+            )
+        )
+    return replace(
+        bundle,
+        cameras=tuple(cameras),
+        rig_from_body=tuple(
+            pose if index == bundle.held_pose else moved
+            for index, (pose, moved) in enumerate(
+                zip(
+                    bundle.rig_from_body,
+                    _moved_poses(np.array(bundle.rig_from_body), step.poses),
+                    strict=True,
+                )
+            )
+        ),
+        body_from_board=tuple(
+            moved_pose(pose, step.rest[layout.of_board[board]])
+            if board in layout.of_board
+            else pose
+            for board, pose in enumerate(bundle.body_from_board)
+        ),
+    )
+
+
+def moved_pose(pose: Pose, change: NDArray[np.float64]) -> Pose:
+    """Return a pose (3, 4) moved by (omega, v), (6,), in the frame it leads to.
+
+    To first order ``x + omega x x + v``; the rotation is exact, and freed of rounding.
+    """
+    return np.asarray(_moved_poses(pose[None], change[None])[0])
+
+
+def _moved_poses(poses: NDArray[np.float64], changes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return poses (F, 3, 4), each moved by its (omega, v), (F, 6)."""
+    omega, v = changes[:, :3], changes[:, 3:]
+    angle = np.linalg.norm(omega, axis=1)
+    x, y, z = (omega / np.where(angle > 0, angle, 1.0)[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    rotation = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
+    u, _, vt = np.linalg.svd(rotation @ poses[:, :, :3])
+    moved = np.zeros_like(poses)
+    moved[:, :, :3] = u @ vt
+    moved[:, :, 3] = (rotation @ poses[:, :, 3:])[..., 0] + v
+    return moved

@@ -1,0 +1,1 @@
+"""CAD objects: their files, their closed surfaces, exact distances and winding numbers."""

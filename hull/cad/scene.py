@@ -1,0 +1,383 @@
+"""The CAD scene: scene.toml, checked, its meshes placed in the world.
+
+A file becomes an object. A file of several parts becomes as many objects, called ``OBJECT.PART``
+after the names in the file; all keys of its table hold for each of them, and each has its own
+centre for a reference point unless the table gives one. In a part's name, ``/`` and blanks become
+``_``; a part without a name is ``part``; parts of the same name become ``bolt``, ``bolt.2``,
+``bolt.3`` in the file's order. ``parts = "merge"`` keeps the file as one object.
+
+A file is turned so that what is up in it is up in the world, before anything else is done: glTF is
+y up by its standard, FBX and COLLADA say, all others are taken as z up, and ``up`` overrides any of
+them.
+STEP, glTF and COLLADA bring their unit (glTF is metres by its standard), and most FBX do; for all
+others the scene must give it. For glTF, COLLADA and FBX it may, against what the file says; for
+STEP it may not.
+"""
+
+import hashlib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from hybridve.calib.errors import SceneError
+from hybridve.calib.pose import placed, rotation_about_axes
+from hybridve.hull.cad.mesh import TESSELLATION_M, CadFile, kind_of, read_cad
+from hybridve.hull.cad.part import Part, Up
+from hybridve.hull.cad.readers import FORMATS, TESSELLATED, WITH_UNIT
+from hybridve.hull.cad.topology import Topology, meeting_faces
+from hybridve.hull.toml_io import expand_root, explain_validation, read_toml
+
+#: How many metres one unit of a mesh file is.
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+
+#: Where the axes of a mesh that is z up lie in one that is not, and with which sign. Seen from the
+#: front, COLLADA's conventions: right is x, x, -y; up is z, y, x; towards the viewer is -y, z, z.
+_FROM_UP: dict[Up, tuple[tuple[int, int, int], tuple[float, float, float]]] = {
+    "y": ((0, 2, 1), (1.0, -1.0, 1.0)),
+    "x": ((1, 2, 0), (-1.0, -1.0, 1.0)),
+}
+
+_Vector = tuple[float, float, float]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _ObjectTable(_Table):
+    # The name becomes a group of the report, where "/" separates and "." stands for the group.
+    name: Annotated[str, Field(pattern=r"^[^/\s.][^/\s]*$")]
+    mesh: str
+    unit: Literal["m", "cm", "mm", "in", "ft"] | None = None
+    up: Up | None = None
+    parts: Literal["split", "merge"] = "split"
+    # Less than a micrometre is more than single precision holds; more than a metre, no part.
+    tessellation_mm: Annotated[float, Field(ge=0.001, le=1000.0)] | None = None
+    translate_mm: _Vector = (0.0, 0.0, 0.0)
+    rotate_deg: _Vector = (0.0, 0.0, 0.0)
+    required_clearance_mm: Annotated[float, Field(ge=0)] = 0.0
+    reference_point_mm: _Vector | None = None
+    recovery_direction: _Vector | None = None
+
+    @field_validator("recovery_direction")
+    @classmethod
+    def _has_length(cls, direction: _Vector | None) -> _Vector | None:
+        if direction is not None and not any(direction):
+            raise ValueError("[0, 0, 0] points nowhere; give a direction")
+        return direction
+
+
+class _KeyError(Exception):
+    """A key of the scene is at fault, not its mesh; the text is complete."""
+
+
+class _EffectTable(BaseModel):
+    # Each effect has keys of its own, which are its own to check.
+    model_config = ConfigDict(extra="allow", frozen=True)
+    kind: str
+
+
+class _SceneTable(_Table):
+    format: Literal["hybridve-scene"]
+    version: Literal[1]
+    root: str = "."
+    object: Annotated[list[_ObjectTable], Field(min_length=1)]
+    effect: list[_EffectTable] = []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneObject:
+    """One CAD object, placed in the world.
+
+    Attributes
+    ----------
+    name : str
+        Unique within the scene.
+    mesh_path : Path
+        The file it was read from.
+    vertices_world : (V, 3) float64
+        Metres.
+    faces : (T, 3) int32
+        Vertex numbers.
+    required_clearance_m : float
+        How far real things are to stay away.
+    reference_point_world : (3,) float64
+        The paper's RP_obj; the centre of the bounding box unless the scene says otherwise.
+    recovery_direction : (3,) float64 or None
+        Unit vector of a constrained object's V_rec, world; the scene gives it, as it gives the
+        reference point, in the frame of the mesh, after that was turned z up.
+    is_closed : bool
+        Whether the surface closes off a volume, so that inside and outside can be told apart.
+    solid_faces : (T, 3) int32 or None
+        Of a closed surface, its triangles in numbers that are equal where corners meet in the file;
+        see `hybridve.hull.cad.topology.meeting_faces`.
+    color : tuple of 4 floats, or None
+        What the file says of its colour, 0 to 1, as a picture shows it (sRGB), and its opacity.
+    tessellation_error_m : float
+        How far the triangles are from the surface that the file holds: an estimate for STEP, 0 for
+        files made of triangles or polygons. Distances to the part are uncertain by that much.
+    about : dict
+        What the report says of where it came from, as plain JSON values; see `load_scene`.
+    vertices_mesh : (V, 3) float64 or None
+        Metres, in the frame of the mesh, turned z up; None if that is the world's.
+    world_from_mesh : (3, 4) float64
+        Where that frame lies: `vertices_world` is `placed` by it.
+    """
+
+    name: str
+    mesh_path: Path
+    vertices_world: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    required_clearance_m: float
+    reference_point_world: NDArray[np.float64]
+    recovery_direction: NDArray[np.float64] | None
+    is_closed: bool = False
+    solid_faces: NDArray[np.int32] | None = None
+    color: tuple[float, float, float, float] | None = None
+    tessellation_error_m: float = 0.0
+    about: dict[str, Any] = field(default_factory=dict)
+    vertices_mesh: NDArray[np.float64] | None = None
+    world_from_mesh: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))
+
+    @property
+    def box_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The lower and upper corner of the axis-aligned bounding box, (3,) metres."""
+        used = self.vertices_world[self.faces.ravel()]
+        return used.min(axis=0), used.max(axis=0)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The CAD objects of one scene and the effects it calls for.
+
+    Attributes
+    ----------
+    path : Path
+        The scene.toml.
+    objects : tuple of SceneObject
+        At least one.
+    effects : tuple of dict
+        The ``[[effect]]`` tables as they stand.
+    checksum : str
+        SHA-256 over the scene.toml, the meshes it names, and the files that these lean on.
+    """
+
+    path: Path
+    objects: tuple[SceneObject, ...]
+    effects: tuple[dict[str, Any], ...]
+    checksum: str
+
+
+def load_scene(path: Path) -> Scene:
+    """Return the scene that a scene.toml describes, its meshes in metres in the world.
+
+    An object's file is turned z up, scaled by its unit, turned by `rotate_deg` about x, then y,
+    then z of the world, and moved by `translate_mm`.
+
+    Each object's `about` holds: ``object`` (the name of its table, which parts of one file share),
+    ``mesh`` (as the scene names it), ``format``, ``part`` (what the object is called after that
+    name; None for a file of one part, or merged), ``unit`` (as the scene or the file names it),
+    ``unit_m`` (metres), ``up`` (the axis that was turned up), ``tessellation_m`` (largest distance
+    of a triangle from the surface it stands for; None if the file is made of triangles),
+    ``n_triangles``, ``n_vertices``, ``n_zero_area``, ``n_open_edges``, ``n_nonmanifold_edges``,
+    ``n_inconsistent_edges``, ``closed``, ``closed_within_m`` (0, or the noise of single precision),
+    ``volume_m3`` and ``inside_out`` (these three None if not closed), and ``material`` (``name``
+    and ``rgba``, either None). How edges are counted, and what closed means, is told in
+    `hybridve.hull.cad.topology`; nothing is repaired.
+
+    Raises
+    ------
+    SceneError
+        One line that names the key at fault, or what is wrong with a mesh.
+    """
+    table, text = read_toml(path, "scene", SceneError)
+    _refuse_missing_units(table, path)
+    try:
+        parsed = _SceneTable.model_validate(table)
+    except ValidationError as error:
+        raise SceneError(explain_validation(error, path)) from None
+    for number, entry in enumerate(parsed.object, start=1):
+        before = [earlier.name for earlier in parsed.object[: number - 1]]
+        if entry.name in before:
+            raise SceneError(
+                f"{path}: object.{number}.name: {entry.name!r} is the name of object."
+                f"{before.index(entry.name) + 1} too; give each object its own"
+            )
+    root = expand_root(parsed.root, path, SceneError)
+    checksum = hashlib.sha256(text)
+    objects: dict[str, SceneObject] = {}
+    for number, entry in enumerate(parsed.object, start=1):
+        label = f"{path}: object.{number}"
+        try:
+            kind = kind_of(root / entry.mesh)
+            _refuse_what_the_kind_has(entry, kind, label)
+            tessellation_m = TESSELLATION_M
+            if entry.tessellation_mm is not None:
+                tessellation_m = entry.tessellation_mm / 1000.0
+            cad = read_cad(
+                root / entry.mesh, merge=entry.parts == "merge", tessellation_m=tessellation_m
+            )
+        except _KeyError as error:
+            raise SceneError(str(error)) from None
+        except SceneError as error:
+            raise SceneError(f"{label}.mesh: {error}") from error
+        if entry.unit is None and cad.unit_m is None:
+            raise SceneError(
+                f"{label}.unit: this key is missing; this {cad.kind} file does not say its unit, "
+                f"and it is never guessed: one of {', '.join(UNITS_M)}"
+            )
+        for part in _place(entry, cad):
+            if part.name in objects:
+                raise SceneError(
+                    f"{label}.name: this object or a part of it would be called {part.name!r}, "
+                    "as another is already; give it another name"
+                )
+            objects[part.name] = part
+        for file in (cad.path, *cad.beside):
+            checksum.update(file.read_bytes())
+    return Scene(
+        path=path,
+        objects=tuple(objects.values()),
+        effects=tuple(entry.model_dump() for entry in parsed.effect),
+        checksum=checksum.hexdigest(),
+    )
+
+
+def _refuse_missing_units(table: dict[str, Any], path: Path) -> None:
+    entries = table.get("object", [])
+    for number, entry in enumerate(entries if isinstance(entries, list) else [], start=1):
+        if not isinstance(entry, dict) or "unit" in entry:
+            continue
+        kind = FORMATS.get(Path(str(entry.get("mesh", ""))).suffix.lower())
+        if kind not in WITH_UNIT:
+            raise SceneError(
+                f"{path}: object.{number}.unit: this key is missing; {kind or 'mesh'} files do not "
+                f"say their unit, and it is never guessed: one of {', '.join(UNITS_M)}"
+            )
+
+
+def _refuse_what_the_kind_has(entry: _ObjectTable, kind: str, label: str) -> None:
+    """Refuse keys that have no meaning for a kind of file."""
+    if kind in TESSELLATED and entry.unit is not None:
+        raise _KeyError(
+            f"{label}.unit: found {entry.unit!r}, but a {kind} file brings its own unit; "
+            "remove this key"
+        )
+    if kind not in TESSELLATED and entry.tessellation_mm is not None:
+        raise _KeyError(
+            f"{label}.tessellation_mm: found {entry.tessellation_mm:g}, but {kind} is made of "
+            "triangles already, only STEP becomes triangles here; remove this key"
+        )
+
+
+def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
+    """Yield the objects that a file becomes."""
+    up = entry.up or cad.up
+    unit_m = UNITS_M[entry.unit] if entry.unit is not None else cad.unit_m
+    if unit_m is None:
+        raise ValueError(f"{entry.name}: neither the scene nor the file gives a unit")
+    rotation = rotation_about_axes(entry.rotate_deg)
+    translation_m = np.array(entry.translate_mm) / 1000.0
+    direction = None
+    if entry.recovery_direction is not None:
+        direction = rotation @ np.array(entry.recovery_direction)
+        direction /= np.linalg.norm(direction)
+    is_assembly = len(cad.parts) > 1
+    names = part_names([part.name for part in cad.parts])
+    for part, topology, name in zip(cad.parts, cad.topologies, names, strict=True):
+        vertices = part.vertices
+        if up != "z":
+            columns, signs = _FROM_UP[up]
+            vertices = vertices[:, columns] * signs
+        vertices_mesh = vertices * unit_m
+        world_from_mesh = np.column_stack([rotation, translation_m])
+        vertices_world = placed(vertices_mesh, world_from_mesh)
+        if entry.reference_point_mm is not None:
+            reference_point_world = (
+                rotation @ (np.array(entry.reference_point_mm) / 1000.0) + translation_m
+            )
+        else:
+            used = vertices_world[part.faces.ravel()]
+            reference_point_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
+        about = {
+            "object": entry.name,
+            "mesh": entry.mesh,
+            "format": cad.kind,
+            "part": name if is_assembly else None,
+            "unit": entry.unit or cad.unit,
+            "unit_m": unit_m,
+            "up": up,
+            "tessellation_m": cad.tessellation_m,
+            "notes": list(cad.notes),
+        }
+        yield SceneObject(
+            name=f"{entry.name}.{name}" if is_assembly else entry.name,
+            mesh_path=cad.path,
+            vertices_world=vertices_world,
+            faces=part.faces,
+            required_clearance_m=entry.required_clearance_mm / 1000.0,
+            reference_point_world=reference_point_world,
+            recovery_direction=direction,
+            is_closed=topology.closed,
+            solid_faces=meeting_faces(part.vertices, part.faces) if topology.closed else None,
+            color=part.rgba,
+            tessellation_error_m=part.off_by_m,
+            about=about | _about_mesh(part, topology, unit_m),
+            vertices_mesh=vertices_mesh,
+            world_from_mesh=world_from_mesh,
+        )
+
+
+def _about_mesh(part: Part, topology: Topology, unit_m: float) -> dict[str, Any]:
+    volume = topology.volume
+    return {
+        "n_triangles": len(part.faces),
+        "n_vertices": len(part.vertices),
+        "tessellation_error_m": part.off_by_m,
+        "n_polygons": part.cuts.n_polygons,
+        "n_bent_polygons": part.cuts.n_bent,
+        "bent_by_m": part.cuts.bent_by * unit_m,
+        "n_zero_area": topology.n_zero_area,
+        "n_open_edges": topology.n_open_edges,
+        "n_nonmanifold_edges": topology.n_nonmanifold_edges,
+        "n_inconsistent_edges": topology.n_inconsistent_edges,
+        "closed": topology.closed,
+        "closed_within_m": (
+            None if topology.closed_within is None else topology.closed_within * unit_m
+        ),
+        "volume_m3": None if volume is None else abs(volume) * unit_m**3,
+        "inside_out": None if volume is None else volume < 0,
+        "material": {
+            "name": part.material or None,
+            "rgba": None if part.rgba is None else list(part.rgba),
+        },
+    }
+
+
+def part_names(names: list[str]) -> list[str]:
+    """Return what parts are called that a file calls so: fit for a report, and all different.
+
+    Examples
+    --------
+    >>> part_names(["bolt", "left plate", "bolt", "", "a/b"])
+    ['bolt', 'left_plate', 'bolt.2', 'part', 'a_b']
+    """
+    fit = [re.sub(r"[/\s\x00-\x1f\x7f]+", "_", name.strip()) or "part" for name in names]
+    # A name that stands in the file goes to the part that has it, not to the second of another.
+    taken: set[str] = set()
+    result = []
+    for number, name in enumerate(fit):
+        given = name
+        count = 1
+        while given in taken or (count > 1 and given in fit[number + 1 :]):
+            count += 1
+            given = f"{name}.{count}"
+        taken.add(given)
+        result.append(given)
+    return result

@@ -1,0 +1,522 @@
+"""What each kind of CAD file may hold besides plain faces: read, or refused by its place."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.mesh_files import (
+    WRITERS,
+    binary_stl,
+    dae,
+    fan,
+    fbx_text,
+    obj,
+    off,
+    text_fbx,
+    text_ply,
+    text_stl,
+)
+from helpers.step_files import step_assembly, step_box, step_file, step_torus
+from numpy.typing import NDArray
+
+from hybridve.calib.errors import SceneError
+from hybridve.hull.cad.mesh import read_cad
+from hybridve.hull.cad.scene import load_scene
+from hybridve.hull.cad.topology import examine_topology, widest_gap
+
+BOX = np.array([[x, y, z] for x in (0, 100) for y in (0, 60) for z in (0, 40)], np.float64)
+QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+TRIANGLES = fan(QUADS)
+INPUT = '<input semantic="VERTEX" source="#v" offset="0"/>'
+
+
+def write(path: Path, content: str | bytes) -> Path:
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def is_the_box(path: Path, scale: float = 1.0) -> bool:
+    """Tell whether a file holds the box whole: twelve triangles, its area, its volume, closed."""
+    cad = read_cad(path)
+    triangles = np.concatenate([part.vertices[part.faces] for part in cad.parts]) * scale
+    area = np.linalg.norm(np.cross(*np.diff(triangles, axis=1).swapaxes(0, 1)), axis=1).sum() / 2
+    volume = sum((topology.volume or np.nan) * scale**3 for topology in cad.topologies)
+    return bool(
+        len(triangles) == 12
+        and np.isclose(area, 24800.0, rtol=1e-6)
+        and np.isclose(volume, 240000.0, rtol=1e-6)
+    )
+
+
+PLAIN_STL = text_stl(BOX, TRIANGLES).decode()
+PLAIN_OBJ = obj(BOX, QUADS).decode()
+BINARY_STL = binary_stl(BOX, TRIANGLES)
+PLAIN_PLY = text_ply(BOX, QUADS).decode()
+PLAIN_OFF = off(BOX, QUADS).decode()
+HALVES = [text_stl(BOX, half).decode() for half in (TRIANGLES[:5], TRIANGLES[5:])]
+FACET = "facet normal 0 0 0\n outer loop\n  vertex 0 0 0\n  vertex 1 0 0\n  vertex 0 1 0\n endloop"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("upper.stl", PLAIN_STL.upper()),
+        ("mac.stl", PLAIN_STL.replace("\n", "\r")),
+        ("windows.stl", PLAIN_STL.replace("\n", "\r\n")),
+        ("mark.stl", "\ufeff" + PLAIN_STL),
+        ("wide.stl", PLAIN_STL.encode("utf-16")),
+        ("blank.stl", "\n  " + PLAIN_STL),
+        ("solids.stl", "".join(HALVES)),
+        ("quads.stl", text_stl(BOX, QUADS)),
+        ("named.stl", PLAIN_STL.replace("solid part", "solid facet normal vertex endsolid cover")),
+        ("latin.stl", PLAIN_STL.replace("part", "Geh\u00e4use").encode("latin-1")),
+        ("zeros.stl", BINARY_STL + b"\0\0"),
+        ("line.stl", BINARY_STL + b"\n"),
+        ("mark.obj", "\ufeff" + "\n".join(PLAIN_OBJ.splitlines()[1:]) + "\n"),
+        ("wide.obj", PLAIN_OBJ.encode("utf-16")),
+        ("mac.obj", PLAIN_OBJ.replace("\n", "\r")),
+        ("unended.obj", PLAIN_OBJ.rstrip("\n")),
+        ("weights.obj", PLAIN_OBJ.replace("\nv ", "\nv  ").replace(".0\n", ".0 1.0\n")),
+        ("old.obj", PLAIN_OBJ.replace("\nf ", "\nfo ")),
+        ("lines.obj", PLAIN_OBJ + "v 1 2 3\nv 3 4 5\nl 9 10\np 9\ndeg 1\ncurv 0 1 9 10\n"),
+        ("unended.off", PLAIN_OFF.rstrip("\n")),
+        ("bare.off", PLAIN_OFF.partition("\n\n")[2]),
+        ("edges.ply", PLAIN_PLY.replace("end_header", "element edge 1\nproperty int vertex1\n"
+        "property int vertex2\nend_header") + "0 1\n"),
+        ("index.ply", PLAIN_PLY.replace("vertex_indices", "vertex_index")),
+    ],
+)  # fmt: skip
+def test_what_programs_write_is_read_whole(tmp_path: Path, name: str, content: str | bytes) -> None:
+    assert is_the_box(write(tmp_path / name, content))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "line"),
+    [
+        ("a.stl", PLAIN_STL.replace("100.0", "100,0"), "line [0-9]+: '100,0' is no number; the"),
+        ("a.stl", PLAIN_STL.replace("endsolid part\n", ""), "ends at line 85, .*endsolid"),
+        ("a.stl", "".join(HALVES)[:-30], "cut off|line [0-9]+: found"),
+        ("a.stl", f"solid\n{FACET}\nendsolid\n", "line 8: found 'endsolid' in a facet"),
+        ("a.stl", PLAIN_STL.replace("  vertex 0.0 0.0 0.0\n", "", 1), "a loop of 2 vertices"),
+        ("a.stl", PLAIN_STL + "facet normal 0 0 1\n", "found 'facet normal 0 0' outside a solid"),
+        ("a.stl", BINARY_STL + b"made by", "691 bytes, where its header promises 684 for 12"),
+        ("a.stl", BINARY_STL[:80] + b"\0\0\0\0" + BINARY_STL[84:], "684 bytes, .*promises 84 "),
+        ("a.stl", BINARY_STL[:80] + b"\xff" * 4 + BINARY_STL[84:], "684 bytes, .*4294967295 tri"),
+        ("a.stl", b"\x01\x02\x03", "neither text nor binary STL: 3 bytes"),
+        ("a.obj", PLAIN_OBJ + "surf 0 1 0 1 1 2 3 4\n", "line 16: 'surf' holds a surface"),
+        ("a.obj", PLAIN_OBJ + "call more.obj\n", "line 16: 'call' holds a surface"),
+        ("a.obj", PLAIN_OBJ + "ff 1 2 3\n", "line 16: 'ff' is no statement of OBJ files"),
+        ("a.obj", PLAIN_OBJ + "v 1 2 3\n", "1 vertices after the last face are used by none"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "last line does not end and its surface"),
+        ("a.obj", PLAIN_OBJ.replace("f ", "f x"), "line 10: 'x1' is no whole number"),
+        ("a.obj", "v 0 0 0\nv 2 2 0\nv 2 0 0\nv 0 2 0\n\nf 1 2 3 4\n", "line 6: .*crosses itself"),
+        ("a.obj", PLAIN_OBJ.encode("utf-16")[2:], "line 1: it holds a zero byte"),
+        ("a.off", PLAIN_OFF.replace("OFF", "4OFF"), "line 1: 4OFF: its vertices have no three"),
+        ("a.off", PLAIN_OFF.replace("OFF #", "OFF BINARY\n#"), "a binary OFF"),
+        ("a.off", PLAIN_OFF + "3 0 1 2\n", "line 18: more than the 8 vertices and 6 faces"),
+        ("a.off", PLAIN_OFF.replace("4 0 1 3 2", "4 0 1 3"), "line 12: a face of 3 corners"),
+        ("a.off", "solid\n", "line 1: it begins with 'solid', not with OFF"),
+        ("a.ply", PLAIN_PLY.replace("element face", "element range_grid"), "'range_grid' makes"),
+        ("a.ply", PLAIN_PLY.replace("vertex_indices", "corners"), "its face have flags.*rename"),
+        ("a.ply", PLAIN_PLY + "1 2\n", "2 words follow the rows"),
+        ("a.ply", WRITERS["big.ply"][0](BOX, QUADS) + b"more", "4 bytes follow the rows"),
+        ("a.ply", PLAIN_PLY.replace("property double z", "property double depth"), "no x, y and z"),
+        ("a.ply", PLAIN_PLY.replace("format ascii", "format utf8"), "line 2: .*no PLY header"),
+    ],
+)  # fmt: skip
+def test_what_is_not_read_is_refused_with_its_place(
+    tmp_path: Path, name: str, content: str | bytes, line: str
+) -> None:
+    path = write(tmp_path / name, content)
+
+    with pytest.raises(SceneError, match=line) as caught:
+        read_cad(path)
+
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_open_obj_is_said_not_to_count_its_faces(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = "\n".join(PLAIN_OBJ.splitlines()[:-1]) + "\n"
+
+    cad = read_cad(write(tmp_path / "open.obj", text))
+
+    (note,) = cad.notes
+    assert "4 open edges" in note
+    assert note in caplog.text
+    assert read_cad(write(tmp_path / "closed.obj", PLAIN_OBJ)).notes == ()
+
+
+def test_polygons_that_are_not_flat_are_counted_in_metres(tmp_path: Path) -> None:
+    bent = BOX.copy()
+    bent[7, 2] += 6.0  # a corner of three faces
+    write(tmp_path / "bent.obj", obj(bent, QUADS))
+    head = 'format = "hybridve-scene"\nversion = 1\n[[object]]\nname = "a"\nunit = "mm"\n'
+
+    (thing,) = load_scene(write(tmp_path / "s.toml", head + 'mesh = "bent.obj"\n')).objects
+
+    assert (thing.about["n_polygons"], thing.about["n_bent_polygons"]) == (6, 1)
+    assert 0.0025 < thing.about["bent_by_m"] < 0.003  # half of 6 mm, along the normal
+    assert thing.tessellation_error_m == 0.0
+
+
+# --- COLLADA ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "primitive",
+    [
+        f'<polygons count="6">{INPUT}'
+        + "".join(f"<p>{' '.join(map(str, quad))}</p>" for quad in QUADS) + "</polygons>",
+        f'<triangles count="12">{INPUT}<p>{" ".join(str(c) for t in TRIANGLES for c in t)}</p>'
+        "</triangles>",
+        f'<trifans count="6">{INPUT}'
+        + "".join(f"<p>{' '.join(map(str, quad))}</p>" for quad in QUADS) + "</trifans>",
+        f'<tristrips count="6">{INPUT}'
+        + "".join(f"<p>{a} {b} {d} {c}</p>" for a, b, c, d in QUADS) + "</tristrips>",
+        f'<lines count="1">{INPUT}<p>0 1</p></lines><polylist count="6">{INPUT}'
+        f"<vcount>{'4 ' * 6}</vcount><p>{' '.join(str(c) for q in QUADS for c in q)}</p>"
+        "</polylist>",
+    ],
+)  # fmt: skip
+def test_every_surface_of_collada_is_read(tmp_path: Path, primitive: str) -> None:
+    assert is_the_box(write(tmp_path / "box.dae", dae(BOX, primitive)))
+
+
+PART = f'<polygons count="1">{INPUT}<p>0 1 3 2</p></polygons>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("<p>0 1 3 2</p>", "<ph><p>0 1 3 2</p><h>4 5</h></ph>", "a ring of fewer than 3 corners"),
+        ("<p>0 1 3 2</p>", "<ph><p>0 1 3 2</p><h>4 5 6</h></ph>", "holes 1: a hole .* not inside"),
+        ('count="1"', 'count="2"', "1 of the 2 that it promises are there"),
+        ("0 1 3 2", "0 1 3 9", "names vertex 9 of 8"),
+        ("<p>0 1 3 2</p>", "<p>0 3 2 1</p>", "polygon 1 of 1: .*crosses itself"),
+        ("mesh>", "convex_mesh>", "'g' is a convex_mesh, which is not read"),
+        ("<instance_geometry", "<instance_controller url='#g'/><instance_geometry", "skinned or"),
+        ('url="#g"', 'url="other.dae#g"', "leans on 'other.dae#g', which is another file"),
+        ("<instance_geometry", "<skew>45 1 0 0 0 1 0</skew><instance_geometry", "a skew places"),
+        ("<instance_geometry", "<scale>1 2</scale><instance_geometry", "a scale of 2 numbers"),
+        ("Z_UP", "UP", "its up_axis is 'UP'"),
+        ("</COLLADA>", "", "its XML cannot be read"),
+        ('count="24"', 'count="27"', "float_array holds 24 of 27 numbers"),
+        ('count="8"', 'count="9"', "too few for 9 vertices"),
+    ],
+)  # fmt: skip
+def test_a_collada_surface_that_is_not_read_is_refused(
+    tmp_path: Path, old: str, new: str, line: str
+) -> None:
+    content = dae(BOX, PART).decode()
+    assert old in content
+
+    with pytest.raises(SceneError, match=line) as caught:
+        read_cad(write(tmp_path / "a.dae", content.replace(old, new)))
+
+    assert "\n" not in str(caught.value)
+
+
+def test_collada_geometry_outside_the_scene_is_said(tmp_path: Path) -> None:
+    content = dae(BOX, PART).decode()
+    more = '<geometry id="h" name="left over"><mesh/></geometry></library_geometries>'
+
+    (note,) = read_cad(
+        write(tmp_path / "a.dae", content.replace("</library_geometries>", more))
+    ).notes
+
+    assert "1 of its geometries are not in its scene, first 'left over'" in note
+
+
+# --- FBX --------------------------------------------------------------------------------------
+
+
+def test_a_box_of_triangles_beside_one_of_quads_is_read_whole(tmp_path: Path) -> None:
+    """Open3D reads the twelve triangles of the first and nothing of the second."""
+    import open3d
+
+    more = text_fbx(BOX + np.array([200.0, 0, 0]), QUADS).decode()
+    geometry = more[more.index("Geometry:") : more.index("Model:")].replace("11,", "12,", 1)
+    content = fbx_text(
+        BOX,
+        TRIANGLES,
+        objects=geometry + 'Model: 23, "Model::quads", "Mesh" {\n}\n',
+        connections='C: "OO",23,0\n\tC: "OO",12,23',
+    )
+    path = write(tmp_path / "two.fbx", content)
+
+    cad = read_cad(path)
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        theirs = open3d.io.read_triangle_mesh(path)
+
+    assert [part.name for part in cad.parts] == ["part", "quads"]
+    assert [len(part.faces) for part in cad.parts] == [12, 12]
+    assert all(topology.volume == pytest.approx(240000) for topology in cad.topologies)
+    assert len(theirs.triangles) == 12
+    assert [part.cuts.n_polygons for part in cad.parts] == [0, 6]
+
+
+@pytest.mark.parametrize(
+    ("settings", "unit_m"),
+    [('P: "UnitScaleFactor", "double", "Number", "",2.54', 0.0254), ("", 1.0)],
+)
+def test_an_fbx_brings_its_unit(tmp_path: Path, settings: str, unit_m: float) -> None:
+    write(tmp_path / "a.fbx", fbx_text(BOX, QUADS, settings=settings))
+    head = 'format = "hybridve-scene"\nversion = 1\n[[object]]\nname = "a"\nmesh = "a.fbx"\n'
+
+    (thing,) = load_scene(write(tmp_path / "s.toml", head)).objects
+    (given,) = load_scene(write(tmp_path / "t.toml", head + 'unit = "mm"\n')).objects
+
+    np.testing.assert_allclose(np.ptp(thing.box_world, axis=0), np.array([100, 60, 40]) * unit_m)
+    np.testing.assert_allclose(np.ptp(given.box_world, axis=0), [0.1, 0.06, 0.04])
+
+
+@pytest.mark.parametrize(
+    ("axes", "expected"),
+    [
+        ("2 1 1 -1 0 1", [[0, 0, 0], [100, 60, 40]]),  # z up, as drawn
+        ("1 1 2 1 0 1", [[0, -40, 0], [100, 0, 60]]),  # y up: turned
+        ("0 1 2 1 1 1", [[0, -40, 0], [60, 0, 100]]),  # x up, y right, z front
+    ],
+)
+def test_what_is_up_in_an_fbx_is_up_in_the_world(
+    tmp_path: Path, axes: str, expected: list[list[int]]
+) -> None:
+    names = ("UpAxis", "UpAxisSign", "FrontAxis", "FrontAxisSign", "CoordAxis", "CoordAxisSign")
+    settings = "\n".join(
+        f'P: "{name}", "int", "Integer", "",{value}'
+        for name, value in zip(names, axes.split(), strict=True)
+    )
+    write(tmp_path / "a.fbx", fbx_text(BOX, QUADS, settings=settings))
+    head = 'format = "hybridve-scene"\nversion = 1\n[[object]]\nname = "a"\nmesh = "a.fbx"\n'
+
+    (thing,) = load_scene(write(tmp_path / "s.toml", head)).objects
+
+    np.testing.assert_allclose(thing.box_world, expected, atol=1e-9)
+    assert thing.about["inside_out"] is False  # even where the axes are a mirror image
+
+
+def deformed(kind: str, percent: int = 0) -> str:
+    channel = (
+        f'Deformer: 45, "SubDeformer::c", "BlendShapeChannel" {{\nDeformPercent: {percent}\n}}\n'
+    )
+    return f'Deformer: 44, "Deformer::", "{kind}" {{\n}}\n{channel}'
+
+
+DEFORMS = 'C: "OO",44,11\n\tC: "OO",45,44'
+
+
+@pytest.mark.parametrize(
+    ("properties", "objects", "connections", "line"),
+    [
+        ("", deformed("Skin"), DEFORMS, "geometry '' has a Skin, so no fixed shape"),
+        ("", deformed("BlendShape", 50), DEFORMS, "is blended with other shapes"),
+        ("", 'Geometry: 12, "Geometry::n", "NurbsSurface" {\n}', 'C: "OO",12,22', "NurbsSurface"),
+        (
+            'P: "PreRotation", "Vector3D", "Vector", "",90,0,0',
+            "",
+            "",
+            "model 'part' has a rotation order or pre-rotation that is switched off",
+        ),
+        ('P: "RotationOrder", "enum", "", "",6\nP: "RotationActive", "bool", "", "",1', "", "",
+         "has the rotation order 6"),
+        ('P: "Lcl Scaling", "Lcl Scaling", "", "A",1,2', "", "", "a Lcl Scaling of .*3 numbers"),
+    ],
+)  # fmt: skip
+def test_an_fbx_that_programs_read_differently_is_refused(
+    tmp_path: Path, properties: str, objects: str, connections: str, line: str
+) -> None:
+    content = fbx_text(BOX, QUADS, properties, objects=objects, connections=connections)
+
+    with pytest.raises(SceneError, match=line) as caught:
+        read_cad(write(tmp_path / "a.fbx", content))
+
+    assert "\n" not in str(caught.value)
+
+
+def test_a_shape_that_is_not_blended_in_counts_for_nothing(tmp_path: Path) -> None:
+    content = fbx_text(BOX, QUADS, objects=deformed("BlendShape"), connections=DEFORMS)
+
+    assert is_the_box(write(tmp_path / "a.fbx", content))
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (
+            lambda text: text.replace("FBXVersion: 7400", "FBXVersion: 6100"),
+            "of version 6100; save",
+        ),
+        (lambda text: text.replace("*24 {", "*27 {"), "its Vertices holds 24 of 27 numbers"),
+        (lambda text: text.replace("7,-4", "7,3"), "its last polygon does not end"),
+        (lambda text: text.replace("FBXVersion", "Version"), "does not say its FBXVersion"),
+        (lambda text: text.replace('C: "OO",22,0', 'C: "OO",22,22'), "the mesh is empty"),
+        (lambda text: text[: text.rindex("}")], "cut off: it ends inside 'Connections'"),
+    ],
+)
+def test_a_damaged_fbx_is_refused(tmp_path: Path, change: Callable[[str], str], line: str) -> None:
+    content = fbx_text(BOX, QUADS).decode()
+    assert change(content) != content
+
+    with pytest.raises(SceneError, match=line):
+        read_cad(write(tmp_path / "a.fbx", change(content)))
+
+
+# --- STEP -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("major", "minor", "tolerance_m"), [(50.0, 10.0, 1e-3), (50.0, 10.0, 2e-4), (5.0, 1.0, 1e-3)]
+)
+def test_a_torus_is_as_close_as_it_says_and_as_was_asked(
+    tmp_path: Path, major: float, minor: float, tolerance_m: float
+) -> None:
+    """In closed form: of points on its triangles, and of their vertices' surface between them."""
+    import igl
+
+    path = write(tmp_path / "torus.step", step_file(step_torus, "mm", major, minor))
+
+    (part,) = read_cad(path, tessellation_m=tolerance_m).parts
+
+    grid = [np.array([i, j, 6 - i - j]) / 6 for i in range(7) for j in range(7 - i)]
+    points = np.concatenate([np.einsum("tij,i->tj", part.vertices[part.faces], w) for w in grid])
+    x, y, z = points.T * 1000.0
+    mesh_off_by_m = np.abs(np.hypot(np.hypot(x, y) - major, z) - minor).max() / 1000.0
+    u, v = (angle.ravel() for angle in np.mgrid[0:6.283:200j, 0:6.283:100j])
+    ring = major + minor * np.cos(v)
+    surface = np.stack([ring * np.cos(u), ring * np.sin(u), minor * np.sin(v)], axis=1) / 1000.0
+    squared = igl.point_mesh_squared_distance(surface, part.vertices, part.faces.astype(np.int64))[
+        0
+    ]
+    true_m = max(mesh_off_by_m, float(np.sqrt(squared.max())))
+    assert true_m <= part.off_by_m <= tolerance_m
+    assert part.off_by_m < 2 * true_m  # and no more than need be
+
+
+def test_a_flat_part_is_off_by_rounding_alone(tmp_path: Path) -> None:
+    path = write(tmp_path / "box.step", step_file(step_box, "mm", (100.0, 60.0, 40.0)))
+
+    (part,) = read_cad(path).parts
+
+    assert 0 < part.off_by_m < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (
+            "CLOSED_SHELL",
+            "CLOSED_SHALL",
+            "its part 'bolt' came out of OpenCASCADE without geometry",
+        ),
+        ("ADVANCED_FACE", "ADVANCED_FICE", "1 of its 12 faces did not become triangles"),
+        ("PLANE(", "PLONE(", "1 of its 12 faces did not become triangles"),
+        (
+            "VERTEX_POINT",
+            "VERTEX_PAINT",
+            "its part 'bolt' came out of OpenCASCADE without geometry",
+        ),
+    ],
+)
+def test_a_step_file_that_lost_something_is_refused(
+    tmp_path: Path, old: str, new: str, line: str
+) -> None:
+    """OpenCASCADE itself says nothing, and returns the rest."""
+    places = [
+        ("bolt", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+        ("plate", (0.0, 0.0, -10.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+    ]
+    text = step_assembly("mm", {"bolt": (1.0, 2.0, 3.0), "plate": (9.0, 9.0, 1.0)}, places)
+
+    with pytest.raises(SceneError, match=line):
+        read_cad(write(tmp_path / "a.step", text.replace(old, new, 1)))
+
+
+def test_a_step_file_that_names_what_is_not_there_is_refused(tmp_path: Path) -> None:
+    lines = step_file(step_box, "mm", (1.0, 2.0, 3.0)).splitlines()
+    face = next(k for k, line in enumerate(lines) if "ADVANCED_FACE" in line)
+    name = lines[face].partition("=")[0]
+
+    with pytest.raises(SceneError, match=f"it names {name}, and there is no such entity"):
+        read_cad(write(tmp_path / "a.step", "\n".join(lines[:face] + lines[face + 1 :])))
+
+
+def strip_of(width: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Return the box with a slot across its top, from one side to the other."""
+    vertices = np.array(
+        [[x, y, 0.0] for x in (0.0, 10.0) for y in (0.0, 5.0 - width / 2, 5.0 + width / 2, 10.0)]
+    )
+    faces = np.array([[0, 4, 5], [0, 5, 1], [2, 6, 7], [2, 7, 3]], np.int32)
+    return vertices, faces
+
+
+def test_a_gap_is_as_wide_as_it_is() -> None:
+    closed = np.array(TRIANGLES, np.int32)
+    assert widest_gap(BOX, closed, 0.1) == 0.0
+    assert widest_gap(BOX, closed[:-2], 0.1) == 100.0  # a face of 100 x 60 is missing
+    assert 30.0 <= widest_gap(BOX, closed[:-1], 0.1) <= 60.0  # half of it
+    vertices, faces = strip_of(0.01)
+    assert widest_gap(vertices, faces, 0.1) == np.inf  # beyond the slot is nothing at all
+    assert examine_topology(vertices, faces).n_open_edges == 8
+
+
+def test_a_gap_narrower_than_the_tolerance_is_found_so() -> None:
+    """A lid of which a sliver across is missing: its ends are short, its sides face each other."""
+    width = 0.004
+    rows = (0.0, 30.0 - width / 2, 30.0 + width / 2, 60.0)
+    lid = np.array([[x, y, 40.0] for x in (0.0, 100.0) for y in rows])
+    vertices = np.concatenate([BOX, lid])
+    walls = [face for face in QUADS if face != [1, 5, 7, 3]]
+    sides = [[8, 12, 13, 9], [10, 14, 15, 11]]
+    corners = {8: 1, 12: 5, 15: 7, 11: 3}
+    sides = [[corners.get(corner, corner) for corner in side] for side in sides]
+    walls = [*[face for face in walls if face not in ([0, 1, 3, 2], [4, 6, 7, 5])],
+             [0, 1, 9, 10, 3, 2], [4, 6, 7, 14, 13, 5]]  # fmt: skip
+    faces = np.array(fan(walls + sides), np.int32)
+
+    gap = widest_gap(vertices, faces, 0.1)
+
+    assert examine_topology(vertices, faces).n_open_edges == 4
+    assert gap == pytest.approx(width, rel=1e-6)
+
+
+# --- real files -------------------------------------------------------------------------------
+
+
+@pytest.mark.recording
+def test_real_files_hold_what_independent_readers_find(recordings: Path) -> None:
+    """Every STL, OBJ and PLY: vertices by VTK, area and count of triangles by trimesh or VTK."""
+    import trimesh
+    import vtk
+
+    paths = sorted(
+        path
+        for path in (recordings / "meshes").rglob("*")
+        if path.suffix.lower() in (".stl", ".obj", ".ply")
+    )
+    readers = {".stl": vtk.vtkSTLReader, ".obj": vtk.vtkOBJReader, ".ply": vtk.vtkPLYReader}
+    assert len(paths) >= 30
+    for path in paths:
+        reader = readers[path.suffix.lower()]()
+        reader.SetFileName(str(path))
+        triangles = vtk.vtkTriangleFilter()
+        triangles.SetInputConnection(reader.GetOutputPort())
+        triangles.Update()
+        measure = vtk.vtkMassProperties()
+        measure.SetInputConnection(triangles.GetOutputPort())
+        measure.Update()
+
+        (part,) = read_cad(path, merge=True).parts
+
+        a, b, c = (part.vertices[part.faces[:, corner]] for corner in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
+        assert area == pytest.approx(measure.GetSurfaceArea(), rel=1e-4), path  # single precision
+        if path.suffix.lower() == ".stl":
+            peer = trimesh.load_mesh(path, process=False)
+            assert len(part.faces) == len(peer.faces), path
+            assert area == pytest.approx(peer.area, rel=1e-9), path
+        else:
+            assert len(part.faces) == triangles.GetOutput().GetNumberOfPolys(), path
