@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hybridve.hull.cad.scene import Scene
     from hybridve.hull.capture.recording import FrameRange
     from hybridve.hull.capture.session import Session
-    from hybridve.hull.evaluate import Chain, EvaluateSettings
+    from hybridve.hull.chain import Chain, EvaluateSettings
 
 #: The table of several sessions or layouts, in the folder of their reports.
 COMPARISON = "COMPARISON.csv"
@@ -114,7 +114,7 @@ def detect(
     from hybridve.cli.summary import print_summary
     from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.evaluate import make_chain
+    from hybridve.hull.chain import make_chain
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.summarize import failing, summarize
     from hybridve.hull.report.write import refuse_existing
@@ -161,16 +161,16 @@ class _How:
 
 def _write_report(chain: "Chain", output: Path, how: _How) -> None:
     """Evaluate one recording against one scene into a report."""
-    from hybridve.hull.evaluate import (
+    from hybridve.hull.about import (
         about_objects,
         about_rig,
         computed_parts,
-        count_frames,
-        evaluate,
         local_origin_m,
         resolved_settings,
         stored_meshes,
     )
+    from hybridve.hull.chain import count_frames
+    from hybridve.hull.evaluate import evaluate
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.machine import machine_text, software_versions
     from hybridve.hull.report.schema import ReportHeader
@@ -309,7 +309,8 @@ def _make_folder(folder: Path) -> None:
 def _detect_one(session: "Session", scene: "Scene", path: Path, how: _How) -> dict[str, Any]:
     """Return the summary of one report; one that is finished is not made again when resuming."""
     from hybridve.calib.errors import ReportError
-    from hybridve.hull.evaluate import about_rig, make_chain, resolved_settings
+    from hybridve.hull.about import about_rig, resolved_settings
+    from hybridve.hull.chain import make_chain
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.summarize import summarize
 

@@ -10,8 +10,8 @@ EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
+    from hybridve.hull.chain import EvaluateSettings
     from hybridve.hull.contact.uncertainty import DoubtSettings
-    from hybridve.hull.evaluate import EvaluateSettings
 
 FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
 
@@ -232,8 +232,8 @@ def evaluation_of(
     """
     from math import radians
 
+    from hybridve.hull.chain import EvaluateSettings
     from hybridve.hull.contact.respond import ResponseSettings
-    from hybridve.hull.evaluate import EvaluateSettings
 
     if backtrack and not response:
         raise click.UsageError("--backtrack says where the response begins; drop --no-response")

@@ -123,7 +123,7 @@ def _cleaner(session: "Session", rig: "Rig") -> "Callable[[int, list[Mask]], lis
     """Return what drops the pieces of a frame's silhouettes that no other camera confirms."""
     from hybridve.hull.agreement.pieces import drop_unconfirmed
     from hybridve.hull.capture.tracks import read_tracks
-    from hybridve.hull.evaluate import first_rig, moved_views, rig_views
+    from hybridve.hull.chain import first_rig, moved_views, rig_views
 
     tracks = read_tracks(session, rig)
     first, lenses = rig_views(session, first_rig(rig, tracks))

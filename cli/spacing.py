@@ -143,7 +143,7 @@ def spacing(
     from hybridve.calib.errors import SessionError
     from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.evaluate import EvaluateSettings, count_frames, make_chain
+    from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
     from hybridve.hull.report.compare import distinct_names
     from hybridve.hull.report.machine import machine_text, software_versions
     from hybridve.hull.report.spacing_file import Spacing, spacing_as_dict, write_spacing

@@ -136,15 +136,10 @@ def sweep(
     """
     import cv2
 
+    from hybridve.hull.about import about_objects, resolved_settings
     from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.evaluate import (
-        EvaluateSettings,
-        about_objects,
-        count_frames,
-        make_chain,
-        resolved_settings,
-    )
+    from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
     from hybridve.hull.query.certify import certify_triangles
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.machine import machine_text, software_versions

@@ -25,24 +25,19 @@ from hybridve.calib.lens import img_from_cam
 from hybridve.calib.placing.hand_eye import mount_camera
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.rig import POSE_PARAMETERS, Mount, Rig, RigCovariance
+from hybridve.hull.about import resolved_settings
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import stored_silhouettes
 from hybridve.hull.capture.rig import rig_digest
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.chain import Chain, EvaluateSettings, make_chain, views_at
 from hybridve.hull.contact.backtrack import first_contact, interpolated_hull
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import detect_contacts
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.spacing import Move
 from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
-from hybridve.hull.evaluate import (
-    Chain,
-    EvaluateSettings,
-    evaluate,
-    make_chain,
-    resolved_settings,
-    views_at,
-)
+from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
