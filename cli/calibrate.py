@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridve.cli import options
-from hybridve.cli.progress import StageProgress
+from hybridve.cli.progress import Terminal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -130,16 +130,16 @@ def calibrate(
     from hybridve.hull.capture.session import load_session
 
     loaded = load_session(session)
-    stages = StageProgress(enabled=progress)
+    terminal = Terminal(enabled=progress)
     if checked is not None:
-        _check(loaded, checked, rig_unit, stages, as_json=as_json)
+        _check(loaded, checked, rig_unit, terminal, as_json=as_json)
         return
     if rig_unit is not None:
         raise click.UsageError("--rig-unit goes with --check")
     _calibrate(
         loaded,
         output or loaded.folder / "rig",
-        stages,
+        terminal,
         box_world=box_world,
         max_error_m=None if max_error_mm is None else max_error_mm / 1000.0,
         with_page=not no_page,
@@ -152,7 +152,7 @@ def calibrate(
 
 
 def _check(
-    session: "Session", source: Path, unit: str | None, stages: StageProgress, *, as_json: bool
+    session: "Session", source: Path, unit: str | None, terminal: Terminal, *, as_json: bool
 ) -> None:
     from hybridve.calib.formats.rigs import read_any_rig
     from hybridve.hull.capture.rig import board_sizes
@@ -162,7 +162,7 @@ def _check(
     sizes_px = set(board_sizes(session).values())
     image_size = sizes_px.pop() if len(sizes_px) == 1 else None
     rig = read_any_rig(source, unit=unit, image_size=image_size, names=names)
-    check = check_session(session, rig, stages)
+    check = check_session(session, rig, terminal.stage)
     if as_json:
         click.echo(json.dumps(_plain({"rig": str(source), **asdict(check)})))
     else:
@@ -195,7 +195,7 @@ def _plain(value: Any) -> Any:
 def _calibrate(
     session: "Session",
     folder: Path,
-    stages: StageProgress,
+    terminal: Terminal,
     *,
     box_world: "Box | None",
     max_error_m: float | None,
@@ -215,9 +215,9 @@ def _calibrate(
     refuse_existing(path, overwrite=overwrite)
     certificate = None
     if session.rig_file is not None:
-        rig = take_elsewhere(session, stages)
+        rig = take_elsewhere(session, terminal.stage)
     else:
-        calibration = calibrate_session(session, stages)
+        calibration = calibrate_session(session, terminal.stage)
         rig = calibration.rig
         volume = working_volume(rig, box_world)
         seen = {

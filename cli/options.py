@@ -1,5 +1,6 @@
 """Arguments and options that commands share: the same thing has the same name everywhere."""
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
@@ -246,6 +247,11 @@ def evaluation_of(
         doubt=doubt_of(doubt=doubt and clearance_mm > 0, mask_std_px=mask_std_px),
         **others,
     )
+
+
+def command_line() -> str:
+    """Return what was called, for the files that it makes."""
+    return " ".join(["hybridve", *sys.argv[1:]])
 
 
 def counted(count: int, what: str) -> str:
