@@ -31,7 +31,8 @@ from hybridve.calib.placing.moving_cameras import mount
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.pose import Pose
 from hybridve.calib.seeing.corner_cache import CornerCache
-from hybridve.calib.seeing.observe import CameraInput, observe_boards
+from hybridve.calib.seeing.inputs import CameraInput
+from hybridve.calib.seeing.observe import observe_boards
 from hybridve.calib.solving.bundle import adjust
 from hybridve.calib.solving.lens_choice import choose_shared_lens
 from hybridve.calib.solving.lens_fit import FittedLens, LensSettings, fit_shared_lens

@@ -29,7 +29,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import open_source
 from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.rig import Rig
-from hybridve.calib.seeing.observe import CameraInput, ObserveSettings
+from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 
 #: Rendered boards of 4 stills place cameras to this, by their distance from the board.
 PLACED = 0.01

@@ -21,7 +21,8 @@ from hybridve.calib.image_io import open_source
 from hybridve.calib.judging.check import check_rig
 from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.rig import Rig
-from hybridve.calib.seeing.observe import CameraInput, ObserveSettings, find_boards, observe_boards
+from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
+from hybridve.calib.seeing.observe import find_boards, observe_boards
 
 pytestmark = pytest.mark.recording
 

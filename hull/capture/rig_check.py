@@ -28,7 +28,8 @@ from hybridve.calib.formats.rigs import rig_to_dict
 from hybridve.calib.judging.check import NotTestableError, RigCheck, check_from_dict, check_rig
 from hybridve.calib.rig import Rig
 from hybridve.calib.seeing.corner_cache import CornerCache
-from hybridve.calib.seeing.observe import CameraInput, find_boards
+from hybridve.calib.seeing.inputs import CameraInput
+from hybridve.calib.seeing.observe import find_boards
 from hybridve.hull.capture.session import Session, SessionCamera
 
 _log = logging.getLogger(__name__)

@@ -16,7 +16,8 @@ from hybridve.calib.boards.target import Chessboard, detect_corners
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.image_io import open_source
 from hybridve.calib.pose import compose
-from hybridve.calib.seeing.observe import CameraInput, observe_boards
+from hybridve.calib.seeing.inputs import CameraInput
+from hybridve.calib.seeing.observe import observe_boards
 
 HORSEMAN = Chessboard(8, 6, 0.115)
 
