@@ -24,7 +24,8 @@ from hybridve.calib.camera import N_PARAMS
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.judging.account import Calibration, put_together
-from hybridve.calib.placing.clock import estimate_offsets, noise_shares, resampled
+from hybridve.calib.placing.board_tracks import noise_shares
+from hybridve.calib.placing.clock import estimate_offsets, resampled
 from hybridve.calib.placing.fixed_cameras import make_bundle, solve_fixed
 from hybridve.calib.placing.link import link_cameras
 from hybridve.calib.placing.moving_cameras import mount

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.placing.hand_eye import PARAMETERS, mount_camera, solve_hand_eye
+from hybridve.calib.placing.hand_eye import PARAMETERS, mount_camera
+from hybridve.calib.placing.mount_fit import solve_hand_eye
 from hybridve.calib.pose import Pose, angle_between, compose, invert
 from hybridve.calib.rig import Mount
 

@@ -19,7 +19,8 @@ from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.placing.labelling import label_still_boards, unmirrored
+from hybridve.calib.placing.labelling import label_still_boards
+from hybridve.calib.placing.scene_votes import unmirrored
 from hybridve.calib.placing.surroundings import describe_scene, with_floor
 from hybridve.calib.pose import compose
 from hybridve.calib.solving.lens_fit import locate_board

@@ -16,15 +16,14 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import project_points
+from hybridve.calib.placing.marks import Mark, triangulate
 from hybridve.calib.placing.world import (
-    Mark,
     Placed,
     SeenBoards,
     place_by_board,
     place_by_points,
     place_on_floor,
     place_world,
-    triangulate,
 )
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.bundle import BundleView

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Observations
-from hybridve.calib.placing.labelling import CLEAR_EVIDENCE, WEAK_EVIDENCE, votes_for_looks
+from hybridve.calib.placing.labelling import WEAK_EVIDENCE, votes_for_looks
+from hybridve.calib.placing.mirrored import CLEAR_EVIDENCE
 from hybridve.calib.placing.surroundings import LooksByVote, choose_looks, sigmas_apart
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.placement import Placed, imaged

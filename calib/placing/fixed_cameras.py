@@ -20,8 +20,9 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.placing.labelling import label_still_boards
 from hybridve.calib.placing.link import Linked, link_cameras
+from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
-from hybridve.calib.placing.world import Mark, SeenBoards, place_world
+from hybridve.calib.placing.world import SeenBoards, place_world
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.rig import RigCovariance
 from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose

@@ -15,8 +15,8 @@ from hybridve.calib.formats.tracker import read_poses
 from hybridve.calib.image_io import FrameSource
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.judging.twins import find_twins, twins_text
+from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.placing.world import Mark
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import recording_of
 from hybridve.hull.capture.rig_check import (
