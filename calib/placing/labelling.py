@@ -79,7 +79,7 @@ def label_still_boards(
     observations : list of Observations
         The same with the clip's symmetric boards listed alike.
     evidence : Labelling
-        What decided.
+        What decided; of several symmetric boards that of which the evidence is weakest.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def label_still_boards(
         mirrored.
     """
     n_looks = max(len(board.looks) for board in boards)
-    evidence = Labelling(looks=n_looks, decided_by="the board's colours or markers")
+    decided: list[Labelling] = []
     labelled = list(observations)
     groups = _Groups(len(cameras))
     for number, board in enumerate(boards):
@@ -112,12 +112,16 @@ def label_still_boards(
         looks = [0] * len(seeing)
         if len(board.looks) > 1:
             looks, told = _choose(board, scenes, seen)
-            evidence = evidence if told is None else replace(told, looks=n_looks)
+            decided += [] if told is None else [told]
         if may_be_mirrored:
             _refuse_mirrored(scenes, looks, seeing, groups)
         for index, look in zip(seeing, looks, strict=True):
             labelled[index] = _turned(labelled[index], number, board.looks[look])
-    return labelled, evidence
+    # The weakest decides: each board by itself may turn the cameras that see it.
+    weakest = min(decided, key=lambda told: told.weakest_sigma or 0.0, default=None)
+    if weakest is None:
+        return labelled, Labelling(looks=n_looks, decided_by="the board's colours or markers")
+    return labelled, replace(weakest, looks=n_looks)
 
 
 def _clip_corners(seen: Observations, board: int) -> NDArray[np.float64] | None:
