@@ -287,7 +287,7 @@ def _digest_of_code() -> str:
     """Return a digest of all that decides how a rig is tested: another version may differ."""
     digest = hashlib.sha256()
     for folder in hybridve.calib.__path__:
-        for path in sorted(Path(folder).glob("*.py")):
+        for path in sorted(Path(folder).rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
