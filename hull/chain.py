@@ -327,10 +327,9 @@ def make_doubter(chain: Chain) -> "Doubter | None":
     names, shift_px = chain.views.names, mask_shift_px(chain)
     errors = outline_errors(
         names,
-        chain.rig.provenance,
+        chain.rig,
         [shift_px[name] for name in names],
         chain.settings.doubt,
-        chain.rig,
     )
     return Doubter(errors, chain.settings.doubt)
 

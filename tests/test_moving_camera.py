@@ -274,7 +274,7 @@ def test_a_mount_calibrated_from_noisy_boards_gives_the_same_answers(
 
     found = list(evaluate(chain_of(path, scene), engine))
 
-    assert 0.0 < about["offset_std_mm"] < 3.0
+    assert 0.0 < about.offset_std_mm < 3.0
     for result, expected in zip(found, results, strict=True):
         for one, true in zip(result.findings, expected.findings, strict=True):
             assert one.contact.certificate == true.contact.certificate
@@ -356,7 +356,7 @@ def test_doubt_comes_from_the_covariance_where_the_camera_was(
     # The head errs most, so that it matters where it was.
     deviations = np.sqrt(np.array([*(of_camera * 3), *(100.0 * np.array(of_camera))]))
     covariance = RigCovariance(tuple(labels), np.diag(deviations**2))
-    rig = Rig(true_rig(0).cameras, {}, covariance, {"head": MOUNT})
+    rig = Rig(true_rig(0).cameras, covariance=covariance, mounts={"head": MOUNT})
     write_rig(tmp_path / "rig" / "rig.json", rig)
     chain = chain_of(path, scene)
     names, settings = chain.views.names, DoubtSettings()
@@ -364,8 +364,8 @@ def test_doubt_comes_from_the_covariance_where_the_camera_was(
     (part,) = chain.scene.objects
     for result in evaluate(chain, engine):
         for finding in result.findings:
-            still = Rig(true_rig(result.index).cameras, {}, covariance)
-            errors = outline_errors(names, {}, [0.0] * len(names), settings, still)
+            still = Rig(true_rig(result.index).cameras, covariance=covariance)
+            errors = outline_errors(names, still, [0.0] * len(names), settings)
             masks = ball_masks(views_of(true_rig(result.index)), CENTERS[result.index], RADIUS_M)
             hull = make_hull(views_at(chain, result.index), masks)
             meter = ClearanceMeter(part.vertices_world, part.faces, is_closed=True)

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.record import CalibrationRecord
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.session import load_session
@@ -102,8 +103,10 @@ def test_horseman_is_calibrated_as_others_did_and_stands_above_the_floor(horsema
     # The references differ by up to 4 % from each other.
     assert np.abs(error).max() < 0.02
     assert (centers[:, 2] > 1.0).all(), "tripods are taller than that"
-    for camera in rig.provenance["cameras"].values():
-        assert camera["intrinsics"]["rms_px"] <= 0.5
+    assert isinstance(rig.provenance, CalibrationRecord)
+    for camera in rig.provenance.cameras.values():
+        assert camera.intrinsics.rms_px is not None
+        assert camera.intrinsics.rms_px <= 0.5
 
 
 @pytest.mark.parametrize(

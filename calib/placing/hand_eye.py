@@ -24,7 +24,7 @@ J. Econometrics 29, 1985 (HC3, the jackknife).
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ from hybridve.calib.placing.mounted_views import (
     wrong_unit,
 )
 from hybridve.calib.pose import Pose
+from hybridve.calib.record import MountRecord
 from hybridve.calib.rig import Mount
 
 #: The unknowns: both poses as in a rig's covariance, (omega, dt) on the left of each.
@@ -60,7 +61,7 @@ def mount_camera(
     sightings: Sequence[Sighting],
     tracking_from_tracker: Mapping[int, Pose],
     world_from_board: Mapping[int, Pose] | None = None,
-) -> tuple[Mount, dict[str, Any]]:
+) -> tuple[Mount, MountRecord]:
     """Return where a camera sits on its tracker, and the tracker's world in ours.
 
     Parameters
@@ -82,16 +83,8 @@ def mount_camera(
     -------
     mount : Mount
         Both fixed poses.
-    diagnostics : dict
-        As plain JSON values: how many ``instants`` and ``views`` were used, and the
-        ``middle_instant`` of them, to draw the camera at; ``looks_turned``, views whose board was
-        listed another way round than most; ``untracked`` instants;
-        ``dropped``, by image, and why; ``rms_px`` of all corners used, and ``closed_form_rms_px``;
-        ``turn_deg``, how far the tracker turned about three axes, most first; ``tracker_scale``
-        and ``tracker_scale_std``; ``parameters`` and their ``covariance`` (12, 12), rad and metres;
-        ``covariance_from`` ("instants left out" or "corners"); ``offset_std_mm`` and
-        ``offset_std_deg``; ``pose_covariance`` (6, 6) of cam_from_world at one instant, what the
-        tracker gets wrong included, in the form of a rig's covariance.
+    told : MountRecord
+        How that was found, and how sure it is, what the tracker gets wrong included.
 
     Raises
     ------
@@ -118,28 +111,60 @@ def mount_camera(
     }
     used = [view for view, is_used in zip(views, fit.used, strict=True) if is_used]
     instants = sorted({view.instant for view in used})
-    about = _uncertainty(camera, used, fit.mount)
-    scale, scale_std = about.pop("tracker_scale"), about.pop("tracker_scale_std")
-    if abs(scale - 1.0) > max(SCALE, SCALE_SIGMAS * scale_std):
-        raise wrong_unit(camera, scale)
-    return fit.mount, {
-        "instants": len(instants),
-        "middle_instant": instants[len(instants) // 2],
-        "views": len(used),
-        "looks_turned": sum(view.look != 0 for view in used),
-        "untracked": untracked,
-        "dropped": missed,
-        "rms_px": rms_of(residuals_of(camera, used, fit.mount)),
-        "closed_form_rms_px": rms_of(residuals_of(camera, used, chosen)),
-        "turn_deg": turn_deg,
-        "tracker_scale": scale,
-        "tracker_scale_std": scale_std,
-        **about,
-    }
+    sure = _uncertainty(camera, used, fit.mount)
+    if abs(sure.scale - 1.0) > max(SCALE, SCALE_SIGMAS * sure.scale_std):
+        raise wrong_unit(camera, sure.scale)
+    deviation = np.sqrt(np.diag(sure.covariance))
+    return fit.mount, MountRecord(
+        instants=len(instants),
+        middle_instant=instants[len(instants) // 2],
+        views=len(used),
+        looks_turned=sum(view.look != 0 for view in used),
+        untracked=tuple(untracked),
+        dropped=missed,
+        rms_px=rms_of(residuals_of(camera, used, fit.mount)),
+        closed_form_rms_px=rms_of(residuals_of(camera, used, chosen)),
+        turn_deg=tuple(turn_deg),
+        tracker_scale=sure.scale,
+        tracker_scale_std=sure.scale_std,
+        parameters=PARAMETERS,
+        covariance=_rows(sure.covariance),
+        covariance_from=sure.covariance_from,
+        offset_std_mm=float(1e3 * np.linalg.norm(deviation[3:6])),
+        offset_std_deg=float(np.rad2deg(np.linalg.norm(deviation[:3]))),
+        pose_covariance=_rows(sure.pose_covariance),
+    )
 
 
-def _uncertainty(camera: Camera, views: list[MountedView], mount: Mount) -> dict[str, Any]:
-    """Return the covariances, as `mount_camera` tells them."""
+def _rows(matrix: Floats) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Uncertainty:
+    """How sure a mount is.
+
+    Attributes
+    ----------
+    scale, scale_std : float
+        The tracker's unit in metres as the pictures show it, and its standard deviation.
+    covariance : (12, 12) float64
+        Of the mount, in the order of `PARAMETERS`.
+    covariance_from : str
+        "instants left out" or "corners".
+    pose_covariance : (6, 6) float64
+        Of cam_from_world at one instant, in the form of a rig's covariance.
+    """
+
+    scale: float
+    scale_std: float
+    covariance: Floats
+    covariance_from: str
+    pose_covariance: Floats
+
+
+def _uncertainty(camera: Camera, views: list[MountedView], mount: Mount) -> _Uncertainty:
+    """Return how sure a mount is by the views it was fitted to."""
     residuals = residuals_of(camera, views, mount).ravel()
     rows = jacobian_of(camera, views, mount)
     instants = np.unique(rows.instant)
@@ -167,17 +192,13 @@ def _uncertainty(camera: Camera, views: list[MountedView], mount: Mount) -> dict
     # Corners are off by themselves, which says nothing of the tracker.
     variance_px2 = unexplained / max(len(residuals) - 6 * n_instants, 1)
     pose_covariance = of_mount + _at_least_zero(errors - variance_px2 * by_corners)
-    deviation = np.sqrt(np.diag(of_all))
-    return {
-        "tracker_scale": float(1.0 + step[12]),
-        "tracker_scale_std": float(np.sqrt(with_scale[12, 12])),
-        "parameters": list(PARAMETERS),
-        "covariance": of_all.tolist(),
-        "covariance_from": "instants left out" if is_known else "corners",
-        "offset_std_mm": float(1e3 * np.linalg.norm(deviation[3:6])),
-        "offset_std_deg": float(np.rad2deg(np.linalg.norm(deviation[:3]))),
-        "pose_covariance": pose_covariance.tolist(),
-    }
+    return _Uncertainty(
+        float(1.0 + step[12]),
+        float(np.sqrt(with_scale[12, 12])),
+        of_all,
+        "instants left out" if is_known else "corners",
+        pose_covariance,
+    )
 
 
 def _at_least_zero(matrix: Floats) -> Floats:

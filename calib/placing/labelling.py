@@ -11,7 +11,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from hybridve.calib.placing.scene_votes import QUARTERS, Scenes, clip_corners, l
 from hybridve.calib.placing.surroundings import (
     choose_looks,
 )
+from hybridve.calib.record import BY_SCENE, Labelling
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ WEAK_EVIDENCE = 3.0
 
 def label_still_boards(
     boards: Sequence[Board], cameras: Sequence[Camera], observations: Sequence[Observations]
-) -> tuple[list[Observations], dict[str, Any]]:
+) -> tuple[list[Observations], Labelling]:
     """List the corners of still, symmetric boards in one order in all cameras.
 
     Cameras whose pictures of the scene around a plain chessboard do not agree are tried with their
@@ -55,8 +55,8 @@ def label_still_boards(
     -------
     observations : list of Observations
         The same with the clip's symmetric boards listed alike.
-    evidence : dict
-        What decided, as plain JSON values.
+    evidence : Labelling
+        What decided; of several symmetric boards that of which the evidence is weakest.
 
     Raises
     ------
@@ -64,10 +64,8 @@ def label_still_boards(
         If a lens cannot have seen the board of its clip; naming the camera, if its picture is
         mirrored.
     """
-    evidence: dict[str, Any] = {
-        "looks": max(len(board.looks) for board in boards),
-        "decided_by": "the board's colours or markers",
-    }
+    n_looks = max(len(board.looks) for board in boards)
+    decided: list[Labelling] = []
     labelled = list(observations)
     groups = Groups(len(cameras))
     for number, board in enumerate(boards):
@@ -91,12 +89,16 @@ def label_still_boards(
         looks = [0] * len(seeing)
         if len(board.looks) > 1:
             looks, told = _choose(board, scenes, seen)
-            evidence |= told
+            decided += [] if told is None else [told]
         if may_be_mirrored:
             refuse_mirrored(scenes, looks, seeing, groups)
         for index, look in zip(seeing, looks, strict=True):
             labelled[index] = _turned(labelled[index], number, board.looks[look])
-    return labelled, evidence
+    # The weakest decides: each board by itself may turn the cameras that see it.
+    weakest = min(decided, key=lambda told: told.weakest_sigma or 0.0, default=None)
+    if weakest is None:
+        return labelled, Labelling(looks=n_looks, decided_by="the board's colours or markers")
+    return labelled, replace(weakest, looks=n_looks)
 
 
 def _turned(seen: Observations, board: int, order: NDArray[np.intp]) -> Observations:
@@ -113,11 +115,11 @@ def _turned(seen: Observations, board: int, order: NDArray[np.intp]) -> Observat
 
 def _choose(
     board: Board, scenes: "Scenes", seen: Sequence[Observations]
-) -> tuple[list[int], dict[str, Any]]:
-    """Choose the look of one board in each camera; return looks and evidence."""
+) -> tuple[list[int], Labelling | None]:
+    """Choose the look of one board in each camera; return looks and what decided, if anything."""
     cameras = scenes.cameras
     n_cameras, n_looks = len(cameras), len(board.looks)
-    evidence: dict[str, Any] = {}
+    evidence = None
     looks = [0] * n_cameras
     hands = [camera.hand_look for camera in seen]
     if n_cameras > 1:
@@ -125,26 +127,27 @@ def _choose(
         chosen = choose_looks(votes)
         looks = list(chosen.looks)
         by_hand = sum(hand is not None for hand in hands) > 1
-        evidence = {
-            "decided_by": "matches of the scene" + (" and corners by hand" if by_hand else ""),
-            "matches_by_look": matches,
-            "margin_sigma": {
+        evidence = Labelling(
+            looks=n_looks,
+            decided_by=BY_SCENE + (" and corners by hand" if by_hand else ""),
+            matches_by_look=matches,
+            margin_sigma={
                 camera.name: round(margin, 2)
                 for camera, margin in zip(cameras, chosen.margins_sigma, strict=True)
             },
-            "weakest_sigma": round(chosen.weakest_sigma, 2),
-            "is_weak": chosen.weakest_sigma < WEAK_EVIDENCE,
-        }
-        log = logger.warning if evidence["is_weak"] else logger.info
+            weakest_sigma=round(chosen.weakest_sigma, 2),
+            is_weak=bool(chosen.weakest_sigma < WEAK_EVIDENCE),
+        )
+        log = logger.warning if evidence.is_weak else logger.info
         log(
             "the board looks the same turned by %d degrees; %s decide which way round each camera "
             "saw it, by %.1f sigma at the weakest%s",
             360 // n_looks,
-            evidence["decided_by"],
+            evidence.decided_by,
             chosen.weakest_sigma,
             ": uncertain; check the cameras' distances, mark the corners by hand in one order, or "
             "use a board with an odd sum of columns and rows"
-            if evidence["is_weak"]
+            if evidence.is_weak
             else "",
         )
     # The world turns with all cameras alike: the first order given by hand sets it, else the way
@@ -188,15 +191,15 @@ def votes_for_looks(
 
 def _votes(
     scenes: "Scenes", hands: Sequence[int | None]
-) -> tuple[NDArray[np.float64], dict[str, list[int]]]:
+) -> tuple[NDArray[np.float64], dict[str, tuple[int, ...]]]:
     """Count votes for each pair of cameras and each look; return the matches among them, too."""
     cameras, n_looks = scenes.cameras, len(scenes.board.looks)
     votes = np.zeros((len(cameras), len(cameras), n_looks))
-    matches = {}
+    matches: dict[str, tuple[int, ...]] = {}
     for i, j in combinations(range(len(cameras)), 2):
         votes[i, j] = scenes.agreeing(i, j)[:: QUARTERS // n_looks]
         pair = f"{cameras[i].name} {cameras[j].name}"
-        matches[pair] = [int(count) for count in votes[i, j]]
+        matches[pair] = tuple(int(count) for count in votes[i, j])
         hand_i, hand_j = hands[i], hands[j]
         if hand_i is not None and hand_j is not None:
             votes[i, j, (hand_j - hand_i) % n_looks] += _HAND_VOTES

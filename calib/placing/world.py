@@ -12,7 +12,6 @@ patterns*, IEEE Trans. PAMI 13(4), 1991.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.marks import Mark, click_warnings, rounded, triangulated
 from hybridve.calib.pose import Pose, compose, invert, transform
+from hybridve.calib.record import WorldRecord
 from hybridve.calib.solving.bundle import BundleView
 
 #: The rig's scale by the named points: what is worth a warning, and what no measurement explains.
@@ -47,12 +47,12 @@ class Placed:
     ----------
     world_from_rig : (3, 4) float64
         Metres.
-    diagnostics : dict
-        Plain JSON values: "kind", "text", "warnings", and what the kind tells (residuals in mm).
+    told : WorldRecord
+        What it was placed by.
     """
 
     world_from_rig: Pose
-    diagnostics: dict[str, Any]
+    told: WorldRecord
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,14 +166,14 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
     )
     return Placed(
         world_from_rig,
-        {
-            "kind": "board",
-            "text": text,
-            "board": str(seen.boards[board]),
-            "instant": instant,
-            "cameras": sorted(cameras[index].name for index in seeing),
-            "warnings": warnings,
-        },
+        WorldRecord(
+            kind="board",
+            text=text,
+            board=str(seen.boards[board]),
+            instant=instant,
+            cameras=tuple(sorted(cameras[index].name for index in seeing)),
+            warnings=tuple(warnings),
+        ),
     )
 
 
@@ -239,17 +239,17 @@ def place_by_points(cameras: Sequence[Camera], marks: Sequence[Mark]) -> Placed:
         )
     return Placed(
         world_from_rig,
-        {
-            "kind": "points",
-            "text": f"{len(marks)} named points",
-            "residuals_mm": {
+        WorldRecord(
+            kind="points",
+            text=f"{len(marks)} named points",
+            residuals_mm={
                 mark.name: round(float(residual), 3)
                 for mark, residual in zip(marks, residuals_mm, strict=True)
             },
-            "scale": round(scale, 5),
-            "misses_px": rounded(misses_px),
-            "warnings": warnings,
-        },
+            scale=round(scale, 5),
+            misses_px=rounded(misses_px),
+            warnings=tuple(warnings),
+        ),
     )
 
 
@@ -323,14 +323,14 @@ def place_on_floor(
     )
     return Placed(
         np.column_stack([rotation, -rotation @ foot]),
-        {
-            "kind": "floor",
-            "text": f"the floor through {len(names) if marks else 'the boards on it'}"
+        WorldRecord(
+            kind="floor",
+            text=f"the floor through {len(names) if marks else 'the boards on it'}"
             + (" points" if marks else ""),
-            "residuals_mm": told,
-            "misses_px": rounded(misses_px),
-            "warnings": click_warnings(cameras, marks, misses_px),
-        },
+            residuals_mm=told,
+            misses_px=rounded(misses_px),
+            warnings=tuple(click_warnings(cameras, marks, misses_px)),
+        ),
     )
 
 

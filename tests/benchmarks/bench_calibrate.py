@@ -55,7 +55,7 @@ def bench_horseman_search(benchmark: Any, horseman_inputs: list[CameraInput]) ->
 def bench_horseman_solve(benchmark: Any, horseman_seen: list[Observations]) -> None:
     """From corners to the rig, the scene around the symmetric board included."""
     rig = benchmark.pedantic(solve_rig, ([HORSEMAN], horseman_seen), rounds=3).rig
-    benchmark.extra_info["rms_px"] = rig.provenance["rms_px"]
+    benchmark.extra_info["rms_px"] = rig.provenance.rms_px
 
 
 @pytest.mark.parametrize(("n_cameras", "n_stills"), [(4, 50), (16, 50)])

@@ -75,7 +75,7 @@ def bench_doubt(benchmark: Any, hulls: list[Hull], near_m: float) -> None:
             seen.append((hull, list(map(agreed, contacts, clearances))))
     settings = DoubtSettings(near_m=near_m)
     names = hulls[0].views.names
-    doubter = Doubter(outline_errors(names, {}, [0.0] * len(names), settings), settings)
+    doubter = Doubter(outline_errors(names, None, [0.0] * len(names), settings), settings)
     queue = itertools.cycle(seen)
 
     def doubt_all() -> list[Doubt]:

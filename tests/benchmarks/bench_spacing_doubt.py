@@ -144,7 +144,7 @@ class Payload:
         views, lenses = rig_views(self._session, rig)
         shift_px = [lens_shift_px(*pair) for pair in zip(rig.cameras, lenses, strict=True)]
         doubter = Doubter(
-            outline_errors(views.names, {}, shift_px, self._settings, rig), self._settings
+            outline_errors(views.names, rig, shift_px, self._settings), self._settings
         )
         blocked, unsure, std_m = [], [], []
         for inside_px in self._inside_px:
