@@ -59,7 +59,9 @@ PAGES = sorted(
 
 def links_of(page: Path) -> list[tuple[Path, str]]:
     """Return what a page links to or shows in the project: the file, and the place in it or ""."""
-    targets = re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text(encoding="utf-8")))
+    targets = re.findall(
+        r"\]\(([^)\s]+)(?: \"[^\"]*\")?\)", without_code(page.read_text(encoding="utf-8"))
+    )
     inside = [target for target in targets if not re.match(r"[a-z]+:", target)]
     parts = [target.partition("#") for target in inside]
     return [((page.parent / name).resolve() if name else page, at) for name, _, at in parts]
