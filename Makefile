@@ -1,7 +1,7 @@
 # make demo    the whole job on a generated session
 # make test    everything that must hold: style, types, import contracts, tests
 # make soak    the property tests with new examples: RUNS=10 times, SEED=1 and up, TESTS=some files
-# make bench   the benchmarks, with the numbers of the README
+# make bench   the benchmarks at full size, into tests/benchmarks/results.json; ONLY="bench_query" some
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
 # make hard-cases   the table of hard cases in tests/README.md: what each column makes of each row
 # make lock    renew requirements.lock after a change of pyproject.toml
@@ -32,8 +32,7 @@ soak: setup
 	@RUNS="$(RUNS)" SEED="$(SEED)" TESTS="$(TESTS)" bash .ci/soak
 
 bench: setup
-	$(BIN)/pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' \
-		--benchmark-columns=median,iqr,min,rounds --benchmark-sort=fullname
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/results.py $(ONLY)
 
 theory: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/bench_theory.py --processes 2 \

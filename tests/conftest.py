@@ -35,6 +35,11 @@ settings.load_profile("same")
 providers.is_local_module_file = lambda path: False  # type: ignore[assignment]
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Benchmarks run at their smallest unless they are asked for what is published."""
+    parser.addoption("--full", action="store_true", help="benchmarks: all cases, at full size")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Draw new examples if a seed is given, which tests of the same examples would not heed."""
     if config.getoption("--hypothesis-seed") is not None:
