@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Observations, Sighting, is_seen
 from hybridve.calib.camera import Camera
-from hybridve.calib.image_io import natural_order
 from hybridve.calib.lens import cam_from_img
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.solving.consensus import common_pose, pose_distances
@@ -138,29 +137,29 @@ def estimate_offsets(
     lenses : sequence of SolvedLens
         The lenses of the cameras.
     observations : sequence of Observations
-        What the same cameras saw; every frame of the clip, so that neighbours can be interpolated.
+        What the same cameras saw, in order of their names; every frame of the clip, so that
+        neighbours can be interpolated.
     max_offset_frames : int
         The largest offset between two cameras that is looked for.
     """
-    order = sorted(range(len(lenses)), key=lambda index: natural_order(observations[index].name))
-    names = [observations[index].name for index in order]
+    names = [seen.name for seen in observations]
     n_cameras = len(names)
     offsets, stds = np.full(n_cameras, np.nan), np.full(n_cameras, np.nan)
     offsets[0] = stds[0] = 0.0
     notes: dict[int, str] = {}
     left_out: dict[str, tuple[int, ...]] = dict.fromkeys(names, ())
     rms_px = np.nan
-    if any(observations[index].is_still for index in order):
+    if any(seen.is_still for seen in observations):
         notes |= dict.fromkeys(range(1, n_cameras), "the boards lie still in the clip")
     elif n_cameras > 1:
-        cameras = [lenses[index].camera for index in order]
-        tracks = [_tracks(observations[index].sightings) for index in order]
+        cameras = [lens.camera for lens in lenses]
+        tracks = [_tracks(seen.sightings) for seen in observations]
         spacing = _spacing(tracks)
-        tracks = [_listed_alike(boards, seen, spacing) for seen in tracks]
-        for camera, seen in enumerate(tracks):
-            jumped = _jumped(seen, spacing)
+        tracks = [_listed_alike(boards, track, spacing) for track in tracks]
+        for camera, track in enumerate(tracks):
+            jumped = _jumped(track, spacing)
             left_out[names[camera]] = tuple(sorted({instant for _, instant in jumped}))
-            tracks[camera] = {key: seen[key] for key in seen if key not in jumped}
+            tracks[camera] = {key: track[key] for key in track if key not in jumped}
         poses = [_located(boards, *pair) for pair in zip(cameras, tracks, strict=True)]
         start = _start(boards, poses, spacing, max_offset_frames)
         for index in range(1, n_cameras):

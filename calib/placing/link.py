@@ -8,7 +8,8 @@ once. So cameras that never see a board at the same time are linked through othe
 before and behind a body through the boards on it; where no camera ever sees both, the two unknown
 poses are found together.
 
-Nothing depends on the order of cameras, boards and views: all is sorted by name first.
+Cameras and boards come in order of name (`hybridve.calib.calibrate.solve_rig` sees to it), and
+views are sorted here, so that nothing depends on the order in which they are listed.
 
 This work is based on: Kruskal, *On the shortest spanning subtree of a graph*, Proc. AMS 7, 1956;
 Shah, *Solving the robot-world/hand-eye calibration problem using the Kronecker product*, J.
@@ -16,7 +17,7 @@ Mechanisms Robotics 5(3), 2013 (cameras and boards that never meet).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Protocol
 
@@ -28,6 +29,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.lens import img_from_cam
+from hybridve.calib.placing.moments import Body, Moment, OnBody, PoseKey, body_of
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.bundle import BundleView
 from hybridve.calib.solving.consensus import CommonPose, common_pose, pose_distances
@@ -76,18 +78,8 @@ _JOINT_GAP = 1e-3
 _MIRROR_IMAGE = np.diag([-1.0, 1.0, 1.0])
 
 
-class NamedBoard(Board, Protocol):
+class NamedBoard(Board, OnBody, Protocol):
     """A board that may be mounted on a body together with others."""
-
-    @property
-    def name(self) -> str:
-        """Its name, unique among the boards."""
-        ...
-
-    @property
-    def body(self) -> str | None:
-        """The rigid body that it sits on; None: it moves alone."""
-        ...
 
 
 class SolvedLens(Protocol):
@@ -121,15 +113,15 @@ class Linked:
     Attributes
     ----------
     cam_from_rig : tuple of (3, 4) float64
-        In the order of the cameras; the rig's frame is that of the camera first by name.
+        In the order of the cameras; the rig's frame is that of the first.
     body_from_board : tuple of (3, 4) float64
-        In the order of the boards; a body's frame is that of its board first by name.
+        In the order of the boards; a body's frame is that of its first board.
     rig_from_body : tuple of (3, 4) float64
         One for each instant, or still, in which a body was seen.
     views : tuple of BundleView
         All views that agree, symmetric boards listed alike in all of them.
-    pose_names : tuple of (int or str, str)
-        What each of `rig_from_body` is: the instant of the clip or the still's name, and the body.
+    pose_keys : tuple of PoseKey
+        What each of `rig_from_body` is of, in order.
     left_out : dict of str to str
         Views that disagree with what the others say, "cam1: image: board", and by how much.
     warnings : tuple of str
@@ -140,13 +132,10 @@ class Linked:
     body_from_board: tuple[Pose, ...]
     rig_from_body: tuple[Pose, ...]
     views: tuple[BundleView, ...]
-    pose_names: tuple[tuple[int | str, str], ...]
+    pose_keys: tuple[PoseKey, ...]
     left_out: dict[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
-
-#: An instant of the clip, or a still: camera and image.
-_Moment = tuple[int, int, str]
 
 #: Cameras, or boards, whose relative poses are known, as indices in order of name.
 _Part = tuple[int, ...]
@@ -154,7 +143,7 @@ _Part = tuple[int, ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """A located view: cameras and boards are numbered in order of name.
+    """A located view.
 
     Attributes
     ----------
@@ -166,7 +155,7 @@ class _Look:
 
     camera: int
     board: int
-    moment: _Moment
+    moment: Moment
     image: str
     pixels: NDArray[np.float64]
     cam_from_board: NDArray[np.float64]
@@ -178,7 +167,7 @@ class _Join:
     """How two parts may be joined: ``second_from_first`` and what speaks for it."""
 
     common: CommonPose
-    moments: tuple[_Moment, ...]
+    moments: tuple[Moment, ...]
     weight: float
     is_clear: bool
 
@@ -199,12 +188,12 @@ def link_cameras(
     Parameters
     ----------
     boards : sequence of NamedBoard
-        The boards; `Sighting.board` counts them.
+        The boards, in order of name; `Sighting.board` counts them.
     lenses : sequence of SolvedLens
         The lenses of the cameras, and where the boards lay in the views they were fitted to. Other
         stills are not used, nor are views that the lens dropped; the clip's others are located.
     observations : sequence of Observations
-        What the same cameras saw.
+        What the same cameras saw, in order of their names.
     is_labelled : bool
         Whether boards that look the same when turned are listed consistently in the clip already.
 
@@ -216,7 +205,6 @@ def link_cameras(
         if a picture is mirrored, if common views share no relative pose or do not tell which way
         round they saw a symmetric board, and if boards of one body are never seen together.
     """
-    cameras = [lens.camera for lens in lenses]
     warnings = _refuse_copies(boards, observations)
     warnings += _refuse_exchanged(boards, lenses, observations)
     chain = _Chain.of(boards, lenses, observations, is_labelled)
@@ -224,15 +212,14 @@ def link_cameras(
     if len(chain.camera_parts) > 1:
         raise _not_linked(chain)
     chain.require_whole_bodies()
-    linked = _read_out(chain, boards, cameras)
-    return replace(linked, warnings=(*warnings, *_same_places(chain)))
+    return _read_out(chain, _Whole.of(chain), warnings)
 
 
 # --- Parts and how they are joined ------------------------------------------------------------
 
 
 class _Chain:
-    """Cameras and boards by name, the parts they form so far, and what could join these.
+    """Cameras and boards, the parts they form so far, and what could join these.
 
     `cam_from_part` and `part_from_board` place each camera and board in its part.
     """
@@ -242,20 +229,16 @@ class _Chain:
         boards: Sequence[NamedBoard],
         cameras: Sequence[Camera],
         looks: Sequence[_Look],
-        camera_order: Sequence[int],
-        board_order: Sequence[int],
     ) -> None:
         self.boards = boards
         self.cameras = cameras
         self.looks = looks
-        self.camera_order = camera_order  # by rank in order of name, the caller's index
-        self.board_order = board_order
         self.camera_parts: list[_Part] = [(rank,) for rank in range(len(cameras))]
         self.board_parts: list[_Part] = [(rank,) for rank in range(len(boards))]
         self.cam_from_part = [np.eye(3, 4) for _ in cameras]
         self.part_from_board = [np.eye(3, 4) for _ in boards]
         self._placed: dict[
-            tuple[_Part, _Part], dict[_Moment, tuple[NDArray[np.float64], float]]
+            tuple[_Part, _Part], dict[Moment, tuple[NDArray[np.float64], float]]
         ] = {}
         self._joins: dict[tuple[str, _Part, _Part, tuple[_Part, ...]], _Join | None] = {}
         distances = [float(np.linalg.norm(look.cam_from_board[0][:, 3])) for look in looks]
@@ -269,32 +252,20 @@ class _Chain:
         observations: Sequence[Observations],
         is_labelled: bool,
     ) -> "_Chain":
-        """Locate all views and put everything in order of name."""
-        camera_order = sorted(
-            range(len(observations)), key=lambda index: natural_order(observations[index].name)
-        )
-        board_order = sorted(range(len(boards)), key=lambda i: natural_order(boards[i].name))
-        board_rank = {index: rank for rank, index in enumerate(board_order)}
-        looks: dict[tuple[_Moment, int, int], _Look] = {}
-        for rank, index in enumerate(camera_order):
-            for sighting in observations[index].sightings:
-                look = _located(boards, lenses[index], rank, board_rank, sighting, is_labelled)
+        """Locate all views and put them in order."""
+        looks: dict[tuple[Moment, int, int], _Look] = {}
+        for camera, (lens, seen) in enumerate(zip(lenses, observations, strict=True)):
+            for sighting in seen.sightings:
+                look = _located(boards, lens, camera, sighting, is_labelled)
                 if look is not None:
                     key = (look.moment, look.camera, look.board)
                     if key not in looks or sighting.image < looks[key].image:
                         looks[key] = look
-        return cls(
-            [boards[index] for index in board_order],
-            [lenses[index].camera for index in camera_order],
-            [looks[key] for key in sorted(looks)],
-            camera_order,
-            board_order,
-        )
+        return cls(boards, [lens.camera for lens in lenses], [looks[key] for key in sorted(looks)])
 
-    def body_of(self, board: int) -> tuple[bool, str]:
-        """Return what tells a body from the others: named, or a board that moves alone."""
-        body = self.boards[board].body
-        return (True, body) if body is not None else (False, self.boards[board].name)
+    def body_of(self, board: int) -> Body:
+        """Return the body of a board."""
+        return body_of(self.boards[board])
 
     def join_all(self) -> None:
         """Join parts, the surest join first, until none is left that could be."""
@@ -333,14 +304,14 @@ class _Chain:
 
     def placed(
         self, cameras: _Part, boards: _Part
-    ) -> dict[_Moment, tuple[NDArray[np.float64], float]]:
+    ) -> dict[Moment, tuple[NDArray[np.float64], float]]:
         """Return where a part of cameras saw a part of boards: by moment poses and their weight.
 
         The poses (K, 3, 4), cameras_from_boards, are those that a symmetric board leaves open.
         """
         key = (cameras, boards)
         if key not in self._placed:
-            by_moment: dict[_Moment, list[_Look]] = {}
+            by_moment: dict[Moment, list[_Look]] = {}
             for look in self.looks:
                 if look.camera in cameras and look.board in boards:
                     by_moment.setdefault(look.moment, []).append(look)
@@ -352,11 +323,7 @@ class _Chain:
 
     def in_part(self, look: _Look) -> NDArray[np.float64]:
         """Return where a view places its board's part in its camera's part: (L, 3, 4)."""
-        from_cam = invert(self.cam_from_part[look.camera])
-        from_part = invert(self.part_from_board[look.board])
-        return np.stack(
-            [compose(from_cam, compose(pose, from_part)) for pose in look.cam_from_board]
-        )
+        return _placed_by(look, self.cam_from_part[look.camera], self.part_from_board[look.board])
 
     def _agreed(self, looks: Sequence[_Look]) -> NDArray[np.float64]:
         """Return the poses of the surest view that the others at this moment agree with."""
@@ -399,7 +366,7 @@ class _Chain:
         self,
         measured: Sequence[NDArray[np.float64]],
         weights: Sequence[float],
-        moments: Sequence[_Moment],
+        moments: Sequence[Moment],
         must_be_clear: bool,
     ) -> _Join | None:
         if not measured:
@@ -489,7 +456,6 @@ def _located(
     boards: Sequence[NamedBoard],
     lens: SolvedLens,
     camera: int,
-    board_rank: Mapping[int, int],
     sighting: Sighting,
     is_labelled: bool,
 ) -> _Look | None:
@@ -506,11 +472,14 @@ def _located(
     # Stills are listed as they were found: only what was seen at once can be listed consistently.
     n_looks = 1 if is_labelled and sighting.instant is not None else len(board.looks)
     turned = [compose(pose, board.board_from_turned(look)) for look in range(n_looks)]
-    moment = (-1, camera, sighting.image) if sighting.instant is None else (sighting.instant, 0, "")
+    moment = (
+        Moment.of_still(camera, sighting.image)
+        if sighting.instant is None
+        else Moment.of_clip(sighting.instant)
+    )
     points_cam = transform(pose, board.points_board[is_seen(pixels)])
     weight = _tilt_weight(points_cam, float(lens.camera.pinhole[0, 0]))
-    board_number = board_rank[sighting.board]
-    return _Look(camera, board_number, moment, sighting.image, pixels, np.stack(turned), weight)
+    return _Look(camera, sighting.board, moment, sighting.image, pixels, np.stack(turned), weight)
 
 
 def _residuals(
@@ -543,6 +512,12 @@ def _tilt_weight(points_cam: NDArray[np.float64], focal_px: float) -> float:
     covariance = np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True)
     variance = float(np.trace((covariance / np.outer(scale, scale))[:3, :3]))
     return 1.0 / max(variance, 1e-12)
+
+
+def _placed_by(look: _Look, cam_from_rig: Pose, body_from_board: Pose) -> NDArray[np.float64]:
+    """Return where a view places its board's body in its camera's rig: (L, 3, 4)."""
+    from_cam, from_body = invert(cam_from_rig), invert(body_from_board)
+    return np.stack([compose(from_cam, compose(pose, from_body)) for pose in look.cam_from_board])
 
 
 def _inverses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -638,60 +613,109 @@ def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
-# --- The whole, in the caller's order ---------------------------------------------------------
+# --- The whole --------------------------------------------------------------------------------
 
 
-def _read_out(chain: _Chain, boards: Sequence[NamedBoard], cameras: Sequence[Camera]) -> Linked:
-    first_from_part = chain.cam_from_part[0]
-    cam_from_rig = [compose(pose, invert(first_from_part)) for pose in chain.cam_from_part]
-    body_from_board = [np.eye(3, 4) for _ in boards]
-    for part in chain.board_parts:
-        body_from_part = invert(chain.part_from_board[part[0]])
-        for rank in part:
-            body_from_board[rank] = compose(body_from_part, chain.part_from_board[rank])
-    chain.cam_from_part, chain.part_from_board = cam_from_rig, body_from_board
+@dataclass(frozen=True, slots=True, eq=False)
+class _Whole:
+    """Cameras and boards that are all joined.
 
-    together: dict[tuple[_Moment, tuple[bool, str]], list[_Look]] = {}
+    Attributes
+    ----------
+    cam_from_rig : tuple of (3, 4) float64
+        The rig's frame is that of the first camera.
+    body_from_board : tuple of (3, 4) float64
+        A body's frame is that of its first board.
+    length_m : float
+        The length that counts as much as a radian.
+    """
+
+    cam_from_rig: tuple[Pose, ...]
+    body_from_board: tuple[Pose, ...]
+    length_m: float
+
+    @classmethod
+    def of(cls, chain: _Chain) -> "_Whole":
+        """Return what a chain of which all cameras are one part has found."""
+        first_from_part = chain.cam_from_part[0]
+        body_from_board = [np.eye(3, 4) for _ in chain.boards]
+        for part in chain.board_parts:
+            body_from_part = invert(chain.part_from_board[part[0]])
+            for board in part:
+                body_from_board[board] = compose(body_from_part, chain.part_from_board[board])
+        return cls(
+            tuple(compose(pose, invert(first_from_part)) for pose in chain.cam_from_part),
+            tuple(body_from_board),
+            chain.length_m,
+        )
+
+    def proposed(self, look: _Look) -> NDArray[np.float64]:
+        """Return where a view places its body in the rig: (L, 3, 4)."""
+        return _placed_by(look, self.cam_from_rig[look.camera], self.body_from_board[look.board])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """A view, and how it suits the pose of its body.
+
+    Attributes
+    ----------
+    look : _Look
+        The view.
+    turn : int
+        The look of the board that suits the pose.
+    missed_px, size_px : float
+        By how far the pose misses it, rms, and how large the board is in the image.
+    """
+
+    look: _Look
+    turn: int
+    missed_px: float
+    size_px: float
+
+
+def _read_out(chain: _Chain, whole: _Whole, warnings: Sequence[str]) -> Linked:
+    together: dict[PoseKey, list[_Look]] = {}
     for look in chain.looks:
-        together.setdefault((look.moment, chain.body_of(look.board)), []).append(look)
-    rig_from_body: dict[tuple[_Moment, tuple[bool, str]], Pose] = {}
-    chosen: list[tuple[tuple[_Moment, tuple[bool, str]], _Look, int, float, float]] = []
+        key = PoseKey(look.moment, chain.body_of(look.board))
+        together.setdefault(key, []).append(look)
+    rig_from_body: dict[PoseKey, Pose] = {}
+    fits: dict[PoseKey, list[_Fit]] = {}
     for key, looks in sorted(together.items()):
-        proposed = [chain.in_part(look) for look in looks]
-        rig_from_body[key] = _middle_pose(proposed, looks, chain.length_m)
-        fits = _fits(chain, looks, proposed, rig_from_body[key])
-        if any(missed_px > _DOUBTFUL_SHARE * size_px for _, missed_px, size_px in fits):
+        proposed = [whole.proposed(look) for look in looks]
+        pose = _middle_pose(proposed, looks, whole.length_m)
+        found = _fits(chain, whole, looks, proposed, pose)
+        if any(fit.missed_px > _DOUBTFUL_SHARE * fit.size_px for fit in found):
             # A board whose tilt was taken for the other one that a plane allows fits its own image
             # only: the right pose fits all.
             trials = [
-                (pose, _fits(chain, looks, proposed, pose)) for pose in np.concatenate(proposed)
+                (pose, _fits(chain, whole, looks, proposed, pose))
+                for pose in np.concatenate(proposed)
             ]
-            rig_from_body[key], fits = min(trials, key=lambda trial: _total_share(trial[1]))
-        chosen += [(key, look, *fit) for look, fit in zip(looks, fits, strict=True)]
-    left_out = _disagreeing(chain, chosen)
-
-    used = sorted({key for key, look, *_ in chosen if id(look) not in left_out})
-    pose_index = {key: index for index, key in enumerate(used)}
+            pose, found = min(trials, key=lambda trial: _total_share(trial[1]))
+        rig_from_body[key], fits[key] = pose, found
+    left_out = _disagreeing(chain, [fit for found in fits.values() for fit in found])
+    kept = {key: [fit for fit in fits[key] if id(fit.look) not in left_out] for key in fits}
+    keys = tuple(key for key in kept if kept[key])
     views = tuple(
         BundleView(
-            camera=chain.camera_order[look.camera],
-            pose=pose_index[key],
-            board=chain.board_order[look.board],
-            pixels=look.pixels[chain.boards[look.board].looks[turn]],
-            image=look.image,
+            camera=fit.look.camera,
+            pose=index,
+            board=fit.look.board,
+            pixels=fit.look.pixels[chain.boards[fit.look.board].looks[fit.turn]],
+            image=fit.look.image,
         )
-        for key, look, turn, _, _ in chosen
-        if id(look) not in left_out
+        for index, key in enumerate(keys)
+        for fit in kept[key]
     )
-    by_camera = {index: rank for rank, index in enumerate(chain.camera_order)}
-    by_board = {index: rank for rank, index in enumerate(chain.board_order)}
     return Linked(
-        tuple(cam_from_rig[by_camera[index]] for index in range(len(cameras))),
-        tuple(body_from_board[by_board[index]] for index in range(len(boards))),
-        tuple(rig_from_body[key] for key in used),
+        whole.cam_from_rig,
+        whole.body_from_board,
+        tuple(rig_from_body[key] for key in keys),
         views,
-        tuple((moment[2] or moment[0], body[1]) for moment, body in used),
+        keys,
         dict(left_out.values()),
+        (*warnings, *_same_places(chain.cameras, whole)),
     )
 
 
@@ -710,31 +734,29 @@ def _middle_pose(
 
 def _fits(
     chain: _Chain,
+    whole: _Whole,
     looks: Sequence[_Look],
     proposed: Sequence[NDArray[np.float64]],
     rig_from_body: Pose,
-) -> list[tuple[int, float, float]]:
-    """Return for each view the look that suits a pose, by how far it misses, and the board's size.
-
-    The cameras and boards of `chain` are those of the whole, not of parts; pixels.
-    """
+) -> list[_Fit]:
+    """Return how views suit a pose of their body, each by the look of its board that does."""
     found = []
     for look, poses in zip(looks, proposed, strict=True):
-        turn = int(np.argmin(pose_distances(rig_from_body[None], poses, chain.length_m)[0]))
+        turn = int(np.argmin(pose_distances(rig_from_body[None], poses, whole.length_m)[0]))
         board = chain.boards[look.board]
         pixels = look.pixels[board.looks[turn]]
         cam_from_board = compose(
-            chain.cam_from_part[look.camera],
-            compose(rig_from_body, chain.part_from_board[look.board]),
+            whole.cam_from_rig[look.camera],
+            compose(rig_from_body, whole.body_from_board[look.board]),
         )
         missed_px = rms(_residuals(chain.cameras[look.camera], cam_from_board, board, pixels))
-        found.append((turn, missed_px, _size_px(pixels)))
+        found.append(_Fit(look, turn, missed_px, _size_px(pixels)))
     return found
 
 
-def _total_share(fits: Sequence[tuple[int, float, float]]) -> float:
+def _total_share(fits: Sequence[_Fit]) -> float:
     """Return how badly a pose suits views: wrong ones count no more than just wrong."""
-    return sum(min(missed_px / size_px, _LEFT_OUT_SHARE) for _, missed_px, size_px in fits)
+    return sum(min(fit.missed_px / fit.size_px, _LEFT_OUT_SHARE) for fit in fits)
 
 
 def _size_px(pixels: NDArray[np.float64]) -> float:
@@ -742,35 +764,33 @@ def _size_px(pixels: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(seen.max(axis=0) - seen.min(axis=0)))
 
 
-def _disagreeing(
-    chain: _Chain,
-    chosen: Sequence[tuple[tuple[_Moment, tuple[bool, str]], _Look, int, float, float]],
-) -> dict[int, tuple[str, str]]:
+def _disagreeing(chain: _Chain, fits: Sequence[_Fit]) -> dict[int, tuple[str, str]]:
     """Return the views that miss what the others say: by id their name and the reason."""
     shares: dict[int, list[float]] = {}
-    for _, look, _, missed_px, size_px in chosen:
-        shares.setdefault(look.camera, []).append(missed_px / size_px)
+    for fit in fits:
+        shares.setdefault(fit.look.camera, []).append(fit.missed_px / fit.size_px)
     found = {}
-    for _, look, _, missed_px, size_px in chosen:
+    for fit in fits:
+        look = fit.look
         limit = max(_LEFT_OUT_SHARE, _LEFT_OUT_MEDIANS * float(np.median(shares[look.camera])))
-        if missed_px > limit * size_px:
+        if fit.missed_px > limit * fit.size_px:
             name, board = chain.cameras[look.camera].name, chain.boards[look.board].name
             found[id(look)] = (
                 f"{name}: {look.image}: {board}",
-                f"misses by {missed_px:.0f} px where the other views see the board, which is "
-                f"{size_px:.0f} px large here",
+                f"misses by {fit.missed_px:.0f} px where the other views see the board, which is "
+                f"{fit.size_px:.0f} px large here",
             )
     return found
 
 
-def _same_places(chain: _Chain) -> tuple[str, ...]:
+def _same_places(cameras: Sequence[Camera], whole: _Whole) -> tuple[str, ...]:
     warnings = []
-    for one, other in combinations(range(len(chain.cameras)), 2):
-        pose, other_pose = chain.cam_from_part[one], chain.cam_from_part[other]
-        if pose_distances(pose[None], other_pose[None], chain.length_m)[0, 0] < _SAME_PLACE:
+    for one, other in combinations(range(len(cameras)), 2):
+        pose, other_pose = whole.cam_from_rig[one], whole.cam_from_rig[other]
+        if pose_distances(pose[None], other_pose[None], whole.length_m)[0, 0] < _SAME_PLACE:
             apart_m = np.linalg.norm(invert(pose)[:, 3] - invert(other_pose)[:, 3])
             warnings.append(
-                f"cameras {chain.cameras[one].name!r} and {chain.cameras[other].name!r} stand in "
+                f"cameras {cameras[one].name!r} and {cameras[other].name!r} stand in "
                 f"one place ({apart_m * 1000:.2f} mm apart) and look the same way: is one "
                 "recording listed twice?"
             )
@@ -782,13 +802,12 @@ def _same_places(chain: _Chain) -> tuple[str, ...]:
 
 def _refuse_copies(boards: Sequence[NamedBoard], observations: Sequence[Observations]) -> list[str]:
     """Refuse two cameras whose corners are the same to the pixel; warn where they nearly are."""
-    ordered = sorted(observations, key=lambda seen: natural_order(seen.name))
     clips = [
         {(s.instant, s.board): s.pixels for s in seen.sightings if s.instant is not None}
-        for seen in ordered
+        for seen in observations
     ]
     warnings = []
-    for one, other in combinations(range(len(ordered)), 2):
+    for one, other in combinations(range(len(observations)), 2):
         common = clips[one].keys() & clips[other].keys()
         apart_px = [
             min(
@@ -800,7 +819,7 @@ def _refuse_copies(boards: Sequence[NamedBoard], observations: Sequence[Observat
         apart_px = [px for px in apart_px if np.isfinite(px)]
         if not apart_px:
             continue
-        names = f"cameras {ordered[one].name!r} and {ordered[other].name!r}"
+        names = f"cameras {observations[one].name!r} and {observations[other].name!r}"
         if max(apart_px) < _SAME_PICTURE_PX:
             raise CalibrationError(
                 f"{names} show the same pictures: in {len(apart_px)} common views the corners are "
@@ -830,12 +849,9 @@ def _refuse_exchanged(
 
     Return warnings where they hardly can.
     """
-    ordered = sorted(
-        zip(lenses, observations, strict=True), key=lambda pair: natural_order(pair[1].name)
-    )
     suspects: list[tuple[Camera, Observations, str, float]] = []
     warnings = []
-    for lens, seen in ordered:
+    for lens, seen in zip(lenses, observations, strict=True):
         of_clip = _typical_error(boards, lens.camera, seen, "clip", lens.views)
         of_stills = _typical_error(boards, lens.camera, seen, "stills", lens.views)
         what, missed_px = ("clip", of_clip) if of_clip > of_stills else ("stills", of_stills)
@@ -942,7 +958,7 @@ def _not_linked(chain: _Chain) -> CalibrationError:
 def _surest_pair(chain: _Chain, first: _Part, second: _Part) -> tuple[int, int]:
     """Return the cameras of two parts that share most moments."""
 
-    def moments(camera: int) -> set[tuple[_Moment, int]]:
+    def moments(camera: int) -> set[tuple[Moment, int]]:
         return {(look.moment, look.board) for look in chain.looks if look.camera == camera}
 
     pairs = [(len(moments(i) & moments(j)), -i, -j) for i in first for j in second]
@@ -955,8 +971,8 @@ def _what_to_record(chain: _Chain, part: _Part) -> str:
     names = [camera.name for camera in chain.cameras]
     instants: list[list[int]] = [[] for _ in names]
     for look in chain.looks:
-        if look.moment[0] >= 0:
-            instants[look.camera].append(look.moment[0])
+        if look.moment.is_clip:
+            instants[look.camera].append(look.moment.instant)
     blind = [rank for rank in part if not instants[rank]]
     if len(blind) == len(part):
         return (
