@@ -19,8 +19,9 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.placing.link import Linked, link_cameras, solve_joint
+from hybridve.calib.placing.link import Linked, link_cameras
 from hybridve.calib.placing.moments import Body, Moment, PoseKey
+from hybridve.calib.placing.never_met import solve_joint
 from hybridve.calib.pose import Pose, angle_between, compose, invert, transform
 from hybridve.calib.solving.lens_fit import locate_board
 
