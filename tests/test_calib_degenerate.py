@@ -609,6 +609,21 @@ def test_boards_back_to_back_link_cameras_that_face_each_other() -> None:
     assert_honest(calibration, certificate, true)
 
 
+def test_the_order_of_boards_and_cameras_changes_no_bit() -> None:
+    boards, seen, _, _ = facing()
+    swapped = [
+        replace(one, sightings=tuple(replace(s, board=1 - s.board) for s in one.sightings[::-1]))
+        for one in seen[::-1]
+    ]
+
+    found, again = solve_rig(boards, seen), solve_rig(boards[::-1], swapped)
+
+    assert again.record == found.record
+    for camera in found.rig.cameras:
+        np.testing.assert_array_equal(again.rig[camera.name].params, camera.params)
+        np.testing.assert_array_equal(again.rig[camera.name].cam_from_world, camera.cam_from_world)
+
+
 def test_boards_back_to_back_that_are_no_body_link_nothing_and_that_is_said() -> None:
     boards, seen, _, _ = facing()
 
