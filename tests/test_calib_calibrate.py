@@ -29,7 +29,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.rigs import rig_to_dict
 from hybridve.calib.image_io import open_source
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.record import provenance_from_plain
+from hybridve.calib.provenance import provenance_from_plain
 from hybridve.calib.rig import Rig
 from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 

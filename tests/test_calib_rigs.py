@@ -17,7 +17,7 @@ from hybridve.calib.formats.colmap import read_colmap_model, write_colmap_model
 from hybridve.calib.formats.rigs import import_rig, read_rig, rig_to_dict, write_rig
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import angle_between, compose, transform
-from hybridve.calib.record import MadeElsewhere
+from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 #: Text with 17 digits gives a projection back to this, in pixels.

@@ -25,12 +25,8 @@ from hybridve.calib.formats.foreign import (
     read_text,
 )
 from hybridve.calib.pose import nearest_to_axes
-from hybridve.calib.record import (
-    CalibrationRecord,
-    MadeElsewhere,
-    provenance_from_plain,
-    provenance_to_plain,
-)
+from hybridve.calib.provenance import MadeElsewhere, provenance_from_plain, provenance_to_plain
+from hybridve.calib.record import CalibrationRecord
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 from hybridve.calib.verdict import RigTest
 

@@ -27,7 +27,7 @@ from hybridve.calib.formats.rigs import (
 )
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import compose, rotation_about_axes
-from hybridve.calib.record import MadeElsewhere
+from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 #: Text with 17 digits gives a projection back to this, in pixels.
