@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.errors import ReportError
+from hybridve.calib.errors import CalibrationError
 from hybridve.calib.judging.certificate import (
     Certificate,
     SeenPoints,
@@ -311,7 +311,7 @@ def test_a_page_cut_off_leaves_nothing(
     two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(ReportError, match="cannot be written"):
+    with pytest.raises(CalibrationError, match="cannot be written"):
         page_of(tmp_path / "no", two)
 
     def interrupt(self: Path, *_: object, **__: object) -> None:

@@ -7,6 +7,7 @@ where its pixel centres lie, the images' size) is given by the caller, never gue
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.files import appearing
 from hybridve.calib.formats import caliscope, kalibr, multical, opencv, rows
 from hybridve.calib.formats.approximate import approximate
 from hybridve.calib.formats.colmap import read_colmap_model, write_colmap_model
@@ -496,15 +498,11 @@ def _make_camera_folders(target: Path, files: Sequence[Path]) -> None:
 
 def _write_texts(texts: Mapping[Path, str]) -> None:
     """Write text files, none under its final name before all are complete."""
-    partials = {path: path.with_name(path.name + ".partial") for path in texts}
     try:
-        for path, text in texts.items():
-            partials[path].write_text(text, encoding="utf-8")
-        for path in texts:
-            partials[path].replace(path)
+        with ExitStack() as files:
+            for path, text in texts.items():
+                files.enter_context(appearing(path)).write_text(text, encoding="utf-8")
     except OSError as error:
-        for partial in partials.values():
-            partial.unlink(missing_ok=True)
         named = error.filename or next(iter(texts))
         raise CalibrationError(
             f"{str(named).removesuffix('.partial')}: cannot be written ({error.strerror})"

@@ -678,9 +678,8 @@ def _outline_is_lost(
     nothing near could move or grow into it.
     """
     views = first_touching.views
-    projected = views.img_from_local @ np.append(point_world - views.origin_world, 1.0)  # (C, 3)
     for camera, outline in enumerate(outlines):
-        x, y, depth_m = projected[camera]
+        x, y, depth_m = views.project(point_world, camera)
         width, height = views.sizes_px[camera]
         if not (depth_m > 0 and 0 <= x < width * depth_m and 0 <= y < height * depth_m):
             continue  # a camera that abstains
@@ -746,12 +745,12 @@ def _box_of(mask: NDArray[np.uint8]) -> _Box:
 
 def _windows(views: Views, body: Body) -> list[_Box]:
     """Return for each camera a box that the object projects into, with some pixels to spare."""
-    ends_local = np.stack([body.lower_world, body.upper_world]) - views.origin_world
-    corners_local = np.array(list(itertools.product(*ends_local.T)))  # (8, 3)
+    ends_world = np.stack([body.lower_world, body.upper_world])
+    corners_world = np.array(list(itertools.product(*ends_world.T)))  # (8, 3)
     windows = []
-    for (width, height), matrix in zip(views.sizes_px.tolist(), views.img_from_local, strict=True):
+    for camera, (width, height) in enumerate(views.sizes_px.tolist()):
         whole = (0, height, 0, width)
-        projected = corners_local @ matrix[:, :3].T + matrix[:, 3]  # (8, 3)
+        projected = views.project(corners_world, camera)  # (8, 3)
         if projected[:, 2].min() <= 1e-6:
             windows.append(whole)  # part of it is behind the camera
             continue

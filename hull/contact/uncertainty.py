@@ -611,15 +611,14 @@ def _touching_points(contact: Contact) -> NDArray[np.float64]:
 
 def _count_seeing(views: Views, point_world: NDArray[np.float64]) -> int:
     """Return how many cameras see a point."""
-    projected = views.img_from_local @ np.append(point_world - views.origin_world, 1.0)  # (C, 3)
-    depth_m = projected[:, 2:]
-    seen = (depth_m > 0) & (projected[:, :2] >= 0) & (projected[:, :2] < views.sizes_px * depth_m)
     n_seeing = 0
-    for camera in np.flatnonzero(seen.all(axis=1)):
-        recorded = views.seen_mask(int(camera))
-        pixel = (projected[camera, :2] / depth_m[camera]).astype(np.int64)
-        column, row = np.minimum(pixel, views.sizes_px[camera] - 1)  # division may round up
-        n_seeing += recorded is None or bool(recorded[row, column])
+    for camera, (width, height) in enumerate(views.sizes_px.tolist()):
+        x, y, depth_m = views.project(point_world, camera).tolist()
+        if not (depth_m > 0 and 0 <= x < width * depth_m and 0 <= y < height * depth_m):
+            continue
+        recorded = views.seen_mask(camera)
+        column, row = min(int(x / depth_m), width - 1), min(int(y / depth_m), height - 1)
+        n_seeing += recorded is None or bool(recorded[row, column])  # division may round up
     return n_seeing
 
 
@@ -805,7 +804,7 @@ def metres_per_pixel(
         The outline's normal in the image, a unit vector.
     """
     matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    projected = views.project(point_world, camera)
     pixel = projected[:2] / projected[2]
     derivatives = (matrix[:2, :3] - pixel[:, None] * matrix[2, :3]) / projected[2]  # (2, 3)
     line, *_ = np.linalg.lstsq(derivatives.T, normal, rcond=None)
@@ -816,8 +815,7 @@ def metres_per_pixel(
 def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64]) -> bool:
     """Tell whether a camera sees background within `_NEAR_PX` of a point that it sees."""
     views = hull.views
-    matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    projected = views.project(point_world, camera)
     if not projected[2] > 0:
         return False
     x, y = projected[:2] / projected[2]
