@@ -672,12 +672,14 @@ def test_a_clock_that_is_late_contradicts_the_others_and_the_way_out_is_said() -
     )
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_a_little_late_is_doubted_and_the_way_out_is_said() -> None:
     _, certificate = calibrated([CARRIED], late_by(0.6))
 
     assert_doubted("'cam2' does not agree with the others|sync = \"estimate\"", certificate)
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_late_is_found_out_where_it_is_asked_for() -> None:
     settings = CalibrationSettings(sync="estimate")
 

@@ -326,6 +326,7 @@ def lie_symmetric_board(session: Path, is_textured: bool) -> None:
     session.write_text(text.replace("columns = 7", "columns = 8"), encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_camera_turned_about_a_board_that_looks_the_same_then_is_refused(session: Path) -> None:
     lie_symmetric_board(session, is_textured=True)
     assert told(load(session))[0] == "agrees"

@@ -169,6 +169,7 @@ def test_known_shifts_are_not_asked_for_again(task: ErringTask, hull: Hull) -> N
     assert blocked_by(hull, wall, move, everything)[2] == 0
 
 
+@pytest.mark.slow
 def test_the_shift_at_95_percent_suffices_in_95_percent_of_recordings() -> None:
     """Two frames, the first decides. 200 repeats and more: tests/benchmarks/bench_spacing_doubt."""
     rng = np.random.default_rng(11)

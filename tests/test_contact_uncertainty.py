@@ -163,6 +163,7 @@ def test_std_grows_in_proportion_to_the_errors_and_adds_up_in_squares() -> None:
     assert one.sigma_px == pytest.approx(np.sqrt(0.09 + 0.64 + 0.04 + 1.0 / 12.0))
 
 
+@pytest.mark.slow
 def test_the_true_hull_is_at_least_so_far_away_in_95_percent_of_recordings() -> None:
     # Outlines and cameras are disturbed, drawn in pixels, and the true cones' hull is kept aside.
     rng = np.random.default_rng(4)
@@ -197,6 +198,7 @@ def test_the_true_hull_is_at_least_so_far_away_in_95_percent_of_recordings() -> 
     assert 0.67 < np.std(pulls) < 1.33
 
 
+@pytest.mark.slow
 def test_a_rig_that_knows_its_covariance_tells_how_clearances_scatter() -> None:
     """Cameras that err together: the hull of where they are thought to be, over many rigs."""
     rng = np.random.default_rng(8)

@@ -223,6 +223,7 @@ def test_a_hull_that_comes_from_nowhere_has_no_speed(
     assert found[2].first_contact_uncertainty_s == 0.5 / FPS
 
 
+@pytest.mark.slow
 def test_something_wholly_inside_a_closed_object_is_told_and_in_an_open_one_is_not(
     tmp_path: Path, session: Path, engine: Engine
 ) -> None:

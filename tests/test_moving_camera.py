@@ -318,6 +318,7 @@ def write_boards(folder: Path, board: Chessboard, noise_px: float) -> str:
     return '[target]\nkind = "chessboard"\n' + target + "\n".join(tables)
 
 
+@pytest.mark.slow
 def test_a_session_with_a_moving_camera_is_calibrated_and_evaluated(
     scene: Path, engine: Engine, tmp_path: Path, run: Run, results: list[FrameResult]
 ) -> None:

@@ -224,6 +224,7 @@ def test_markup_in_names_and_values_is_text(tmp_path: Path) -> None:
         ElementTree.fromstring(image)
 
 
+@pytest.mark.slow
 def test_equal_input_gives_the_same_bytes(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -306,6 +307,7 @@ def test_a_rig_without_covariance_or_of_other_cameras_is_refused(
         page_of(tmp_path, (rig.only(["right", "left"]), certificate, seen, volume))
 
 
+@pytest.mark.slow
 def test_a_page_cut_off_leaves_nothing(
     tmp_path: Path,
     two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume],

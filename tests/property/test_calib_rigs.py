@@ -75,6 +75,7 @@ def img_from_world(camera: Camera) -> NDArray[np.float64]:
     return np.asarray(camera.pinhole @ camera.cam_from_world)
 
 
+@pytest.mark.slow
 @given(
     camera=pinholes(),
     log_factor=st.floats(-8.0, 8.0),

@@ -205,6 +205,7 @@ def touching_fraction(
 
 
 # Not shrunk: an example takes a tenth of a second.
+@pytest.mark.slow
 @settings(max_examples=30, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(
     radius_m=st.floats(0.04, 0.1),

@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 from helpers.cones import BOX_FACES, box_vertices, views_from
 from helpers.contacts import FREE
 from helpers.hulls import (
@@ -48,6 +49,7 @@ def hull_beside_box(seed: int, n_cameras: int, n_balls: int) -> tuple[Hull, floa
     return make_hull(views, seen), max(nearest_m, 0.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(seed=seeds, n_cameras=st.integers(2, 5), n_balls=st.integers(1, 3))
 def test_the_real_thing_is_not_farther_away_than_the_bound(
