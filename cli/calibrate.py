@@ -205,7 +205,7 @@ def _calibrate(
     as_json: bool,
 ) -> None:
     from hybridve.calib.formats.colmap import write_colmap_model
-    from hybridve.calib.formats.rigs import write_rig
+    from hybridve.calib.formats.rig_json import write_rig
     from hybridve.calib.judging.certificate import SeenPoints, certify, working_volume
     from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
     from hybridve.hull.report.write import refuse_existing

@@ -15,7 +15,7 @@ from helpers.records import make_camera_record, make_check, make_record
 from hybridve.calib import record as record_module
 from hybridve.calib import verdict as verdict_module
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import read_rig, rig_to_dict, write_rig
+from hybridve.calib.formats.rig_json import read_rig, rig_to_dict, write_rig
 from hybridve.calib.plain import Told, to_plain
 from hybridve.calib.provenance import MadeElsewhere, provenance_from_plain
 from hybridve.calib.record import (

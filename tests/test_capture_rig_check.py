@@ -15,7 +15,7 @@ from helpers.records import make_record
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import read_rig, write_rig
+from hybridve.calib.formats.rig_json import read_rig, write_rig
 from hybridve.calib.pose import compose, rotation_about_axes
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.record import BY_SCENE, Labelling

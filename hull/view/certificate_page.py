@@ -24,7 +24,8 @@ from hybridve.calib.lens import parameter_names
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.covariance import parameter_slices
-from hybridve.hull.view.certificate_charts import draw_camera, draw_errors, draw_rig
+from hybridve.hull.view.certificate_charts import draw_camera
+from hybridve.hull.view.rig_charts import draw_errors, draw_rig
 
 #: What a page can say at first sight.
 State = Literal["good", "limits", "refused"]
