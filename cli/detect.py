@@ -172,13 +172,13 @@ def _write_report(chain: "Chain", output: Path, how: _How) -> None:
         stored_meshes,
     )
     from hybridve.hull.query.choose import open_engine
-    from hybridve.hull.report.machine import machine_text, software_versions
+    from hybridve.hull.report.machine import Run
     from hybridve.hull.report.schema import ReportHeader
     from hybridve.hull.report.write import ReportWriter
 
     with open_engine(how.engine) as query:
         header = ReportHeader(
-            command=" ".join(["hybridve", *sys.argv[1:]]),
+            run=Run.this(),
             objects=about_objects(chain),
             settings=resolved_settings(chain),
             rig=about_rig(chain),
@@ -186,8 +186,6 @@ def _write_report(chain: "Chain", output: Path, how: _How) -> None:
             renderer=query.renderer,
             parts=computed_parts(chain.settings),
             cameras=chain.views.names,
-            versions=software_versions(),
-            machine=machine_text(),
             local_origin_m=local_origin_m(chain),
             meshes=stored_meshes(chain),
             points=how.points,

@@ -1,7 +1,6 @@
 """``hybridve sweep``: accuracy against time, over viewports and engines."""
 
 import json
-import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -147,12 +146,11 @@ def sweep(
     )
     from hybridve.hull.query.certify import certify_triangles
     from hybridve.hull.query.choose import open_engine
-    from hybridve.hull.report.machine import machine_text, software_versions
+    from hybridve.hull.report.machine import Run
     from hybridve.hull.report.sweep_file import (
         Sweep,
         read_sweep,
         sweep_as_dict,
-        utc_now,
         write_sweep,
     )
     from hybridve.hull.report.write import refuse_existing
@@ -216,10 +214,7 @@ def sweep(
     write_sweep(
         output,
         Sweep(
-            command=" ".join(["hybridve", *sys.argv[1:]]),
-            machine=machine_text(),
-            created_utc=utc_now(),
-            versions=software_versions(),
+            run=Run.this(),
             settings={
                 **resolved_settings(chain),
                 "viewports": list(viewports),
