@@ -67,7 +67,7 @@ def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     assert sweep.settings["session_sha256"]
     assert sweep.settings["viewports"] == [2, 4, 8]
     assert sweep.settings["repeats"] == 2
-    assert sweep.versions["numpy"] == np.__version__
+    assert sweep.run.versions["numpy"] == np.__version__
     image = cv2.imread(str(tmp_path / "sweep.png"))
     assert image is not None
     assert len(np.unique(image)) > 50

@@ -26,8 +26,10 @@ from hybridve.hull.contact.uncertainty import Doubt
 from hybridve.hull.contact.verdict import VERDICTS
 from hybridve.hull.report import write
 from hybridve.hull.report.collisions import StoredMesh
+from hybridve.hull.report.machine import Run
 from hybridve.hull.report.read import read_points, read_report
-from hybridve.hull.report.schema import STAGES, CameraFrame, FrameResult, Kind, ReportHeader
+from hybridve.hull.report.result_file import Kind
+from hybridve.hull.report.schema import STAGES, CameraFrame, FrameResult, ReportHeader
 from hybridve.hull.report.summarize import spans, summarize
 from hybridve.hull.report.write import ReportWriter
 
@@ -48,7 +50,7 @@ ORIGIN_M = (4_000_000.0, -200.0, 0.0)
 
 def a_header(n_objects: int, **changes: Any) -> ReportHeader:
     values: dict[str, Any] = {
-        "command": "hybridve detect",
+        "run": Run("hybridve detect", "a machine", {}, ""),
         "objects": tuple({"name": f"object_{i}", "triangles": 12} for i in range(n_objects)),
         "settings": {"viewport": 10},
         "rig": {"cameras": []},
