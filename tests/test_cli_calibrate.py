@@ -19,8 +19,11 @@ from hybridve.calib.boards.board import Detection, Effort
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.judging.account import Calibration
 from hybridve.calib.pose import compose
+from hybridve.calib.record import BY_SCENE, Labelling
 from hybridve.cli.calibrate import NOT_GOOD_ENOUGH, calibrate
+from hybridve.hull.capture import rig as rig_of_session
 
 Run = Callable[..., int]
 Captured = pytest.CaptureFixture[str]
@@ -252,6 +255,65 @@ def test_a_rig_that_is_not_good_enough_has_a_status_of_its_own(
     assert "not to 0.001 mm as --max-error-mm asks" in shown.err
     assert shown.out.startswith("good to ")
     assert (tmp_path / "rig" / "rig.json").is_file()
+
+
+def contradicted(made: Calibration) -> Calibration:
+    assert made.record.adjustment is not None
+    adjustment = replace(made.record.adjustment, warnings=("cameras do not agree.",))
+    return replace(made, record=replace(made.record, adjustment=adjustment))
+
+
+def labelled_by_chance(made: Calibration) -> Calibration:
+    weak = Labelling(
+        looks=2,
+        decided_by=BY_SCENE,
+        matches_by_look={},
+        margin_sigma={},
+        weakest_sigma=1.0,
+        is_weak=True,
+    )
+    return replace(made, record=replace(made.record, labelling=weak))
+
+
+def with_a_twin(made: Calibration) -> Calibration:
+    first, second, third = made.rig.cameras
+    twin = replace(first, name=second.name)
+    return replace(made, rig=replace(made.rig, cameras=(first, twin, third)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("doubtful", "told"),
+    [
+        (contradicted, "cameras do not agree."),
+        (labelled_by_chance, "which way round each camera saw it"),
+        (with_a_twin, "stand in one place"),
+    ],
+)
+def test_a_rig_that_is_doubted_passes_no_gate(
+    run: Run,
+    capsys: Captured,
+    calibrated: tuple[Path, dict[str, Any], str],
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    doubtful: Callable[[Calibration], Calibration],
+    told: str,
+) -> None:
+    """However small the error that is stated: without the doubt this rig passes 100 mm."""
+    calibrate_well = rig_of_session.calibrate_session
+    monkeypatch.setattr(
+        rig_of_session, "calibrate_session", lambda *given: doubtful(calibrate_well(*given))
+    )
+    arguments = ["calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page"]
+
+    assert run(*arguments, "--max-error-mm", "100") == NOT_GOOD_ENOUGH
+
+    shown = capsys.readouterr()
+    assert shown.out.startswith("not to be trusted: ")
+    assert told in shown.out.splitlines()[0]
+    assert "an unknown error, not to 100 mm" in shown.err
+    assert calibrated[1]["certificate"]["doubts"] == []
 
 
 @pytest.mark.slow

@@ -7,9 +7,8 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +16,18 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Board, Observations, is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.image_io import natural_order
 from hybridve.calib.placing.labelling import label_still_boards
 from hybridve.calib.placing.link import Linked, link_cameras
+from hybridve.calib.placing.marks import Mark
+from hybridve.calib.placing.moments import Body, body_of
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
-from hybridve.calib.placing.world import Mark, SeenBoards, place_world
+from hybridve.calib.placing.world import SeenBoards, place_world
 from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.record import Labelling, Noise, Outlier, WorldRecord
 from hybridve.calib.rig import RigCovariance
 from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose
 from hybridve.calib.solving.consensus import common_pose
 from hybridve.calib.solving.covariance import (
-    Noise,
     in_world,
     measure_group_noise,
     measure_noise,
@@ -68,7 +68,7 @@ _LEAST_SIGMA_PX = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """Fixed cameras in the world, and what they were adjusted to."""
+    """Fixed cameras in the world, what they were adjusted to, and what was decided on the way."""
 
     adjusted: Adjusted
     linked: Linked
@@ -76,7 +76,10 @@ class Solved:
     cameras: tuple[Camera, ...]
     covariance: RigCovariance
     world_from_rig: Pose
-    outliers: list[dict[str, Any]]
+    outliers: list[Outlier]
+    noise_by_group: dict[str, Noise]
+    labelling: Labelling | None
+    world: WorldRecord
 
 
 def solve_fixed(
@@ -85,7 +88,6 @@ def solve_fixed(
     lenses: Sequence[FittedLens],
     requests: Mapping[str, LensRequest],
     settings: CalibrationSettings,
-    about: dict[str, Any],
     shares: Mapping[str, float],
 ) -> Solved:
     """Link fixed cameras, adjust them with all they saw, and place them in the world.
@@ -100,8 +102,6 @@ def solve_fixed(
         By camera what is asked of its lens.
     settings : CalibrationSettings
         How it is done.
-    about : dict
-        What is decided on the way is put here, for the provenance.
     shares : mapping of str to float
         By camera the noise of interpolated points by that of frames
         (`hybridve.calib.placing.clock.noise_shares`).
@@ -113,13 +113,14 @@ def solve_fixed(
     """
     is_still = all(seen.is_still for seen in observations)
     seen: Sequence[Observations] = observations
+    labelling = None
     if is_still:
         cameras = [lens.camera for lens in lenses]
-        seen, about["labelling"] = label_still_boards(boards, cameras, observations)
+        seen, labelling = label_still_boards(boards, cameras, observations)
         _warn_of_flat_views(boards, cameras, seen)
     elif any(len(board.looks) > 1 for board in boards):
         looks = max(len(board.looks) for board in boards)
-        about["labelling"] = {"looks": looks, "decided_by": "poses common to all frames"}
+        labelling = Labelling(looks=looks, decided_by="poses common to all frames")
     linked = link_cameras(boards, lenses, seen, is_labelled=is_still)
     bundle = make_bundle(boards, lenses, linked, requests)
     rough = adjust(bundle, settings.lens.loss_px)
@@ -130,15 +131,13 @@ def solve_fixed(
     )
     cleaned, outliers = without_outliers(rough)
     adjusted, noise, groups = adjust_weighed(cleaned, linked, shares)
-    about["noise_by_group"] = {name: asdict(told) for name, told in groups.items()}
     placed = place_world(
         settings.world,
         adjusted.bundle.cameras,
         _seen_boards(boards, linked, adjusted.bundle),
         settings.marks,
     )
-    about["world"] = placed.diagnostics
-    for warning in placed.diagnostics["warnings"]:
+    for warning in placed.told.warnings:
         logger.warning("%s", warning)
     rig_from_world = invert(placed.world_from_rig)
     in_the_world = tuple(
@@ -154,7 +153,16 @@ def solve_fixed(
             *_world_errors(boards, linked, adjusted.bundle, covariance, settings),
         )
     return Solved(
-        adjusted, linked, noise, in_the_world, covariance, placed.world_from_rig, outliers
+        adjusted,
+        linked,
+        noise,
+        in_the_world,
+        covariance,
+        placed.world_from_rig,
+        outliers,
+        groups,
+        labelling,
+        placed.told,
     )
 
 
@@ -171,7 +179,7 @@ def adjust_weighed(
     even = adjust(bundle)
     groups = [
         "board clip"
-        if isinstance(linked.pose_names[view.pose][0], int)
+        if linked.pose_keys[view.pose].moment.is_clip
         else f"stills of {bundle.cameras[view.camera].name}"
         for view in bundle.views
     ]
@@ -251,7 +259,7 @@ def _world_errors(
 
 def _seen_boards(boards: Sequence[Board], linked: Linked, bundle: Bundle) -> SeenBoards:
     return SeenBoards(
-        boards, bundle.body_from_board, bundle.rig_from_body, linked.pose_names, bundle.views
+        boards, bundle.body_from_board, bundle.rig_from_body, linked.pose_keys, bundle.views
     )
 
 
@@ -263,7 +271,7 @@ def make_bundle(
 ) -> Bundle:
     """Return the start of the joint adjustment; its frame is that of the body most cameras saw."""
     held, _, _ = SeenBoards(
-        boards, linked.body_from_board, linked.rig_from_body, linked.pose_names, linked.views
+        boards, linked.body_from_board, linked.rig_from_body, linked.pose_keys, linked.views
     ).main()
     rig_from_held = linked.rig_from_body[held]
     held_from_rig = invert(rig_from_held)
@@ -278,9 +286,9 @@ def make_bundle(
         for number, lens in zip(lens_of, lenses, strict=True)
         if requests.get(lens.camera.name, LensRequest()).params is not None
     }
-    bodies: dict[str, int] = {}
-    for board in sorted(range(len(boards)), key=lambda index: natural_order(boards[index].name)):
-        bodies.setdefault(boards[board].body or f"{boards[board].name}/", board)
+    bodies: dict[Body, int] = {}
+    for index, board in enumerate(boards):
+        bodies.setdefault(body_of(board), index)
     return Bundle(
         points_board=tuple(board.points_board for board in boards),
         cameras=tuple(
@@ -308,7 +316,7 @@ def _rigid(pose: Pose) -> Pose:
 def _refuse_wrong_clips(rough: Adjusted, linked: Linked) -> None:
     for view, missed in zip(rough.bundle.views, rough.residuals_px, strict=True):
         missed_px = rms(missed[is_seen(missed)])
-        is_clip = isinstance(linked.pose_names[view.pose][0], int)
+        is_clip = linked.pose_keys[view.pose].moment.is_clip
         if is_clip and missed_px > _WRONG_CLIP_PX:
             name = rough.bundle.cameras[view.camera].name
             raise CalibrationError(
@@ -323,7 +331,7 @@ def _disagreeing(
     """Return a warning if no rig explains what the cameras saw, though their lenses do."""
     squares: list[list[float]] = [[] for _ in lenses]
     for view, missed in zip(rough.bundle.views, rough.residuals_px, strict=True):
-        if isinstance(linked.pose_names[view.pose][0], int):
+        if linked.pose_keys[view.pose].moment.is_clip:
             squares[view.camera] += (missed[is_seen(missed)] ** 2).sum(axis=1).tolist()
     missed_px = [float(np.sqrt(np.mean(own))) if own else 0.0 for own in squares]
     worst = max(
@@ -350,7 +358,7 @@ def _odd_one_out(boards: Sequence[Board], linked: Linked, bundle: Bundle) -> int
     for view in bundle.views:
         camera = bundle.cameras[view.camera]
         located = locate_board(camera, boards[view.board].points_board, view.pixels)
-        if located is not None and isinstance(linked.pose_names[view.pose][0], int):
+        if located is not None and linked.pose_keys[view.pose].moment.is_clip:
             placed.setdefault((view.pose, view.board), {})[view.camera] = located[0]
     count = len(bundle.cameras)
     apart = np.full((count, count), np.nan)
@@ -400,7 +408,7 @@ def other_tilt(boards: Sequence[Board], camera: Camera, seen: Observations) -> f
     return max(factors, default=None)
 
 
-def without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
+def without_outliers(rough: Adjusted) -> tuple[Bundle, list[Outlier]]:
     """Return a bundle without the points that miss by far, and these, the worst first."""
     bundle = rough.bundle
     limits_px = []
@@ -417,7 +425,7 @@ def without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
         sigma_px = 1.4826 * float(np.median(np.abs(missed))) if len(missed) else 0.0
         limits_px.append(max(_OUTLIER_SIGMAS * sigma_px, _OUTLIER_PX))
     views: list[BundleView] = []
-    outliers: list[dict[str, Any]] = []
+    outliers: list[Outlier] = []
     for view, residuals in zip(bundle.views, rough.residuals_px, strict=True):
         misses_px = np.linalg.norm(residuals, axis=1)
         with np.errstate(invalid="ignore"):
@@ -425,16 +433,16 @@ def without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
         if is_outlier.sum() > len(residuals) / 4:
             is_outlier[:] = False  # a whole view is judged by its lens and by the other views
         outliers += [
-            {
-                "camera": bundle.cameras[view.camera].name,
-                "image": view.image,
-                "board": view.board,
-                "point": int(point),
-                "missed_px": round(float(misses_px[point]), 2),
-            }
+            Outlier(
+                bundle.cameras[view.camera].name,
+                view.image,
+                view.board,
+                int(point),
+                round(float(misses_px[point]), 2),
+            )
             for point in np.flatnonzero(is_outlier)
         ]
         pixels = np.where(is_outlier[:, None], np.nan, view.pixels)
         views.append(replace(view, pixels=pixels))
-    outliers.sort(key=lambda told: -told["missed_px"])
+    outliers.sort(key=lambda told: -told.missed_px)
     return replace(bundle, views=tuple(views)), outliers

@@ -1,8 +1,8 @@
 """Moving cameras on their trackers, beside the fixed ones of a rig."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.camera import Camera
@@ -10,6 +10,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.fixed_cameras import Solved
 from hybridve.calib.placing.hand_eye import mount_camera
 from hybridve.calib.pose import Pose, compose
+from hybridve.calib.record import MountRecord
 from hybridve.calib.rig import Mount
 from hybridve.calib.solving.lens_fit import FittedLens
 
@@ -20,7 +21,7 @@ class Mounted:
 
     camera: Camera
     mount: Mount
-    told: dict[str, Any]
+    told: MountRecord
 
 
 def mount(
@@ -42,21 +43,18 @@ def mount(
     world_from_board = None if solved is None else _still_boards(boards, seen, solved)
     mount, told = mount_camera(lens.camera, boards, seen.sightings, track, world_from_board)
     # A moving camera stands in the rig where it was in the middle of its clip.
-    middle = mount.cam_from_world(track[told["middle_instant"]])
+    middle = mount.cam_from_world(track[told.middle_instant])
     return Mounted(replace(lens.camera, cam_from_world=middle), mount, told)
 
 
 def _still_boards(boards: Sequence[Board], seen: Observations, solved: "Solved") -> dict[int, Pose]:
     """Return where the boards lie that were still in the clip of the fixed cameras."""
-    bundle = solved.adjusted.bundle
+    bundle, keys = solved.adjusted.bundle, solved.linked.pose_keys
+    moments = Counter(key.body for key in keys if key.moment.is_clip)
     found: dict[int, Pose] = {}
     for view in bundle.views:
-        instants = {
-            name[0]
-            for index, name in enumerate(solved.linked.pose_names)
-            if isinstance(name[0], int) and name[1] == solved.linked.pose_names[view.pose][1]
-        }
-        if isinstance(solved.linked.pose_names[view.pose][0], int) and len(instants) == 1:
+        key = keys[view.pose]
+        if key.moment.is_clip and moments[key.body] == 1:
             rig_from_board = compose(
                 bundle.rig_from_body[view.pose], bundle.body_from_board[view.board]
             )

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hybridve.calib.placing.world import Mark
-from hybridve.calib.seeing.observe import ObserveSettings
+from hybridve.calib.placing.marks import Mark
+from hybridve.calib.seeing.inputs import ObserveSettings
 from hybridve.calib.solving.lens_fit import LensSettings
 
 

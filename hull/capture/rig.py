@@ -15,8 +15,8 @@ from hybridve.calib.formats.tracker import read_poses
 from hybridve.calib.image_io import FrameSource
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.judging.twins import find_twins, twins_text
+from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.placing.world import Mark
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import recording_of
 from hybridve.hull.capture.rig_check import (
@@ -85,7 +85,7 @@ def load_rig(session: Session, progress: Progress | None = None) -> Rig:
     """Return the session's rig: the one it names, or the one that was calibrated for it.
 
     Whichever it is, it was tested against the boards that the session's cameras saw, if they saw
-    any (`hybridve.hull.capture.rig_check`); its provenance says so, as "check".
+    any (`hybridve.hull.capture.rig_check`); its ``check`` says so.
 
     Parameters
     ----------
@@ -142,7 +142,8 @@ def take_elsewhere(session: Session, progress: Progress | None = None) -> Rig:
     label = session.rig_file.pattern
     rig = _import(session, session.rig_file, board_sizes(session))
     rig = examined(session, rig, label, progress)
-    if rig.provenance["check"]["verdict"] == "no board":
+    assert rig.check is not None
+    if rig.check.verdict == "no board":
         _log.warning(
             "%s: the rig %r is taken as it is: there is no board in the session to test it against",
             session.path,

@@ -26,8 +26,8 @@ from hybridve.calib.rig import Rig
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.session import Session
+from hybridve.hull.chain import rig_views
 from hybridve.hull.contact.clearance import ClearanceMeter
-from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
 

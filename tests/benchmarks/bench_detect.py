@@ -17,10 +17,11 @@ from hybridve.calib.rig import Rig
 from hybridve.hull.cad.scene import SceneObject, load_scene
 from hybridve.hull.capture.recording import FrameRange
 from hybridve.hull.capture.session import Session
+from hybridve.hull.chain import Chain, EvaluateSettings, rig_views
 from hybridve.hull.contact.detect import Body, make_body
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.uncertainty import DoubtSettings
-from hybridve.hull.evaluate import Chain, EvaluateSettings, evaluate, rig_views
+from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.choose import open_engine
 
 SCENE = Path(__file__).parent.parent.parent / "data" / "horseman" / "scene.toml"

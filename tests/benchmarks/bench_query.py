@@ -201,7 +201,7 @@ def bench_work(
     for _ in range(2):  # clusters are made for the second frame
         asked.update(clusters=0, triangles=0)
         hull = next_hull()
-        frame = clusters.make_frame(hull)
+        frame = hull.frame
         shares = clusters.make_shares(hull, frame, mesh, threads)
         left = [rectangles.survivors.py_func(*share, frame) for share in shares]
     sampled = sum(int(part.is_open.any(axis=1).sum()) for part in left)
