@@ -26,10 +26,10 @@ from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
 from hybridve.calib.image_io import open_source
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.record import provenance_from_plain
+from hybridve.calib.provenance import provenance_from_plain
 from hybridve.calib.rig import Rig
 from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 

@@ -15,8 +15,10 @@ from hybridve.calib.boards.board import Board, Observations, Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.judging.check import SCALE_TOLERANCE, SIGNIFICANCE, check_rig
+from hybridve.calib.judging.case import SIGNIFICANCE
+from hybridve.calib.judging.check import check_rig
 from hybridve.calib.judging.comparison import chance_of
+from hybridve.calib.judging.wording import SCALE_TOLERANCE
 from hybridve.calib.pose import compose, rotation_about_axes
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import adjust, moved_pose

@@ -21,7 +21,7 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.judging.certificate import Certificate, SeenPoints, certify, working_volume
 from hybridve.calib.lens import img_from_cam

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import PINHOLE_MODELS, Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import import_rig, read_rig, write_rig
+from hybridve.calib.formats.rig_json import read_rig, write_rig
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.lens import (
     Undistortion,
     cam_from_img,

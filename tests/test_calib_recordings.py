@@ -16,7 +16,8 @@ from hybridve.calib.boards.markers import Charuco
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import import_rig, rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.image_io import open_source
 from hybridve.calib.judging.check import check_rig
 from hybridve.calib.placing.settings import CalibrationSettings

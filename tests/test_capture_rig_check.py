@@ -15,9 +15,10 @@ from helpers.records import make_record
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import read_rig, write_rig
+from hybridve.calib.formats.rig_json import read_rig, write_rig
 from hybridve.calib.pose import compose, rotation_about_axes
-from hybridve.calib.record import BY_SCENE, Labelling, MadeElsewhere
+from hybridve.calib.provenance import MadeElsewhere
+from hybridve.calib.record import BY_SCENE, Labelling
 from hybridve.calib.rig import Rig
 from hybridve.cli.calibrate import NOT_GOOD_ENOUGH
 from hybridve.hull.capture import rig_check

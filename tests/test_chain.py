@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.pose import angle_between, compose, invert
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 from hybridve.hull.report.read import read_report

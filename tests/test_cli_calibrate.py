@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Detection, Effort
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.pose import compose
 from hybridve.calib.record import BY_SCENE, Labelling

@@ -9,6 +9,7 @@ from helpers.hulls import ball_hull
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from hybridve.hull.contact.outline_errors import OutlineErrors
 from hybridve.hull.contact.spacing import (
     NOTHING,
     Move,
@@ -19,7 +20,7 @@ from hybridve.hull.contact.spacing import (
     union,
 )
 from hybridve.hull.contact.spacing_doubt import UnsureShifts, unsure_shifts
-from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubter, OutlineErrors
+from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubter
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
 

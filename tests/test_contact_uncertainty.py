@@ -17,17 +17,10 @@ from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import moved_pose
 from hybridve.calib.verdict import RigTest
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
+from hybridve.hull.contact.cones import metres_per_pixel
 from hybridve.hull.contact.detect import Contact
-from hybridve.hull.contact.uncertainty import (
-    ONE_SIDED_95,
-    Doubt,
-    Doubter,
-    DoubtSettings,
-    OutlineErrors,
-    metres_per_pixel,
-    outline_errors,
-    without_camera,
-)
+from hybridve.hull.contact.outline_errors import DoubtSettings, OutlineErrors, outline_errors
+from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubt, Doubter, without_camera
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 

@@ -19,8 +19,8 @@ from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import Chain, EvaluateSettings, make_chain
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
+from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.respond import ResponseSettings
-from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native

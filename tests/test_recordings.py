@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.record import CalibrationRecord
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import load_rig

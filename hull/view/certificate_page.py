@@ -17,13 +17,15 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from hybridve.calib.errors import ReportError
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.files import appearing
 from hybridve.calib.judging.certificate import Certificate, SeenPoints, Volume
 from hybridve.calib.lens import parameter_names
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.covariance import parameter_slices
-from hybridve.hull.view.certificate_charts import draw_camera, draw_errors, draw_rig
+from hybridve.hull.view.certificate_charts import draw_camera
+from hybridve.hull.view.rig_charts import draw_errors, draw_rig
 
 #: What a page can say at first sight.
 State = Literal["good", "limits", "refused"]
@@ -123,7 +125,7 @@ def write_certificate_page(
 
     Raises
     ------
-    ReportError
+    CalibrationError
         If it cannot be written.
     ValueError
         If the rig has no covariance, or the certificate is that of other cameras.
@@ -157,14 +159,11 @@ def write_certificate_page(
             "</body>\n</html>\n",
         ]
     )
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        with appearing(path) as partial:
+            partial.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+        raise CalibrationError(f"{path}: cannot be written: {error}") from error
 
 
 def state_of(certificate: Certificate, max_error_m: float | None = None) -> State:

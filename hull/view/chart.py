@@ -13,6 +13,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 
 #: What a chart may be written as.
 SUFFIXES = (".png", ".svg", ".pdf")
@@ -145,14 +146,11 @@ def refuse_suffix(path: Path) -> None:
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure, which appears only when it is complete."""
-    partial = path.with_name(path.name + ".partial")
     try:
-        figure.savefig(partial, format=path.suffix.lower()[1:], dpi=_DPI)
-        partial.replace(path)
+        with appearing(path) as partial:
+            figure.savefig(partial, format=path.suffix.lower()[1:], dpi=_DPI)
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def draw_chart(

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from hybridve.hull.contact.bulge import Ray, farthest_on, real_upper
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
-from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubter
 from hybridve.hull.query.silhouettes import Hull, Unseen, make_hull
 
 BOX_HALF_M = 0.1
