@@ -77,7 +77,7 @@ def seen_around(
         assert observed.picture is not None
         image = np.ascontiguousarray(observed.picture[:, ::-1])
         seen.append(in_picture(replace(observed, sightings=(*stills, None)), board, image))
-    return tuple([*cameras, *map(lens_mirrored, cameras)]), tuple(seen)
+    return (*cameras, *map(lens_mirrored, cameras)), tuple(seen)
 
 
 def in_picture(seen: Observations, board: Chessboard, image: np.ndarray) -> Observations:
