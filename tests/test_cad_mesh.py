@@ -478,7 +478,7 @@ def test_meshes_outside_the_scene_are_said(tmp_path: Path) -> None:
     assert len(cad.parts) == 1
 
 
-def test_a_glb_cut_off_anywhere_is_refused_and_so_is_more(tmp_path: Path) -> None:
+def test_a_glb_cut_off_anywhere_is_refused_and_so_is_more() -> None:
     content = square_gltf().glb()
 
     for end in range(len(content)):

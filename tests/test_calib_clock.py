@@ -199,6 +199,7 @@ def test_a_symmetric_board_tells_them_too() -> None:
     assert clocks.offset_frames == pytest.approx(LATE, abs=EXACT_FRAMES)
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_changes_no_bit() -> None:
     recording = out_of_time(LATE, 40, noise_px=0.2)
     late = CalibrationSettings(sync="estimate")

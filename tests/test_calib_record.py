@@ -174,10 +174,8 @@ def places_of(value: object, at: Place = ()) -> Iterator[tuple[str, Place]]:
 
 
 #: Each field at the first place where it stands.
-PLACES = {name: place for name, place in reversed(list(places_of(whole())))}
-CHECK_PLACES = {
-    name: place for name, place in reversed(list(places_of(whole_test().check, ("check",))))
-}
+PLACES = dict(reversed(list(places_of(whole()))))
+CHECK_PLACES = dict(reversed(list(places_of(whole_test().check, ("check",)))))
 
 
 def changed(plain: dict[str, Any], place: Place, how: str) -> dict[str, Any]:

@@ -99,6 +99,7 @@ def test_a_turned_listing_belongs_to_a_turned_board(board: Chessboard) -> None:
         )
 
 
+@pytest.mark.slow
 def test_corners_are_found_where_they_are_with_pixel_centres_at_a_half(
     near: tuple[Camera, NDArray[np.uint8]],
 ) -> None:

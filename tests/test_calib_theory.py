@@ -69,6 +69,7 @@ def test_errors_are_as_small_as_theory_allows() -> None:
     assert mean == pytest.approx(1.0, abs=four_deviations)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_each_rig_says() -> None:
     """Deviations stated a fifth too small or too large would have the mean 1.56 or 0.69."""
     mean, four_deviations = mean_of_squares([matrix_of(rig) for rig in calibrations()])

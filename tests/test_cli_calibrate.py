@@ -281,6 +281,7 @@ def with_a_twin(made: Calibration) -> Calibration:
     return replace(made, rig=replace(made.rig, cameras=(first, twin, third)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("doubtful", "told"),
     [

@@ -43,6 +43,7 @@ def distance_to_cube_surface_m(center: np.ndarray) -> float:
     return float(outside if outside > 0 else inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "engine",
     [
@@ -100,6 +101,7 @@ def test_the_engines_write_the_same_points(
     assert len(found["native"][0]) > 0
 
 
+@pytest.mark.slow
 def test_a_finer_accuracy_takes_smaller_steps_and_says_so(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -141,6 +143,7 @@ def test_a_damaged_picture_is_a_row_with_a_reason(run: Run, tmp_path: Path, scen
     assert report.objects["hit"].collides.tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 def test_a_late_camera_is_read_in_step_with_the_others(
     run: Run, tmp_path: Path, scene: Path
 ) -> None:
@@ -181,6 +184,7 @@ def test_a_camera_that_stops_early_is_told_with_what_to_do(
     assert len(read_report(path).index) == 9
 
 
+@pytest.mark.slow
 def test_status_3_tells_of_a_clash_only_if_asked(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -228,6 +232,7 @@ def test_something_inside_or_too_near_is_a_clash_too(
         assert run("detect", session, "--scene", near, "-o", path, *common) == status, required_mm
 
 
+@pytest.mark.slow
 def test_an_existing_report_is_refused_and_kept(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -354,6 +359,7 @@ def test_json_of_detect_is_that_of_summary(
     assert json.loads(capsys.readouterr().out) == told
 
 
+@pytest.mark.slow
 def test_summary_counts_what_the_report_holds(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

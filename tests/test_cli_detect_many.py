@@ -100,6 +100,7 @@ def test_a_report_of_several_is_that_of_one(
     assert one.settings == other.settings
 
 
+@pytest.mark.slow
 def test_one_that_fails_does_not_lose_the_others(
     run: Run,
     tmp_path: Path,

@@ -169,6 +169,7 @@ def test_engines_that_do_not_open_are_left_out_unless_they_were_named(
     assert len(read_sweep(tmp_path / "sweep.h5").engines) == 2, "the sweep from before is kept"
 
 
+@pytest.mark.slow
 def test_the_reference_is_left_out_where_it_would_take_long(
     run: Run,
     tmp_path: Path,

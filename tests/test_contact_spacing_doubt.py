@@ -104,12 +104,14 @@ def test_what_violates_or_is_undecided_is_never_sure(
     assert found.std_m > 0
 
 
+@pytest.mark.slow
 def test_larger_errors_need_more_room(task: ErringTask, hull: Hull) -> None:
     ends_m = [unsure(task, hull, px).unsure_m[-1, 1] for px in (0.0, 0.5, 1.0, 2.0)]
 
     assert (np.diff(ends_m) > 0).all()
 
 
+@pytest.mark.slow
 def test_of_several_objects_each_is_kept_with_its_own_deviation(
     task: ErringTask, hull: Hull
 ) -> None:

@@ -26,6 +26,7 @@ def drawn_now() -> list[list[float]]:
     return examples
 
 
+@pytest.mark.slow
 def test_modules_that_are_loaded_by_chance_change_no_example(tmp_path: Path) -> None:
     # Their numbers would be drawn, if they were read, five times in a hundred.
     (tmp_path / "odd.py").write_text(f"ODD = {[k / 1000.3 for k in range(1, 1000)]}\n")

@@ -103,6 +103,7 @@ def hits(results: list[FrameResult]) -> list[Finding | None]:
     return [result.findings[0] if result.is_valid else None for result in results]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skip", range(1, len(CENTERS) + 1))
 def test_frames_taken_up_anywhere_are_the_same_to_the_bit(
     session: Path, scene: Path, engine: Engine, results: list[FrameResult], skip: int

@@ -165,6 +165,7 @@ def prepared(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     return Path(folder), environment
 
 
+@pytest.mark.slow
 def test_after_preparing_detect_compiles_nothing(
     prepared: tuple[Path, dict[str, str]], tmp_path: Path
 ) -> None:

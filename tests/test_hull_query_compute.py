@@ -436,6 +436,7 @@ def test_buffers_grow_when_a_frame_overflows_them(
     assert len(found) == len(mesh) * 70 * 71 // 2  # all of it is inside
 
 
+@pytest.mark.slow
 def test_a_frame_too_large_for_the_device_is_asked_in_parts(
     context: moderngl.Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:

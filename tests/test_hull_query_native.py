@@ -27,6 +27,7 @@ from hybridve.hull.query.reference import Reference
 from hybridve.hull.query.silhouettes import make_hull
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_queries", [1, 2], ids=["triangles", "clusters"])
 def test_only_what_rectangles_leave_open_is_sampled(
     monkeypatch: pytest.MonkeyPatch, n_queries: int

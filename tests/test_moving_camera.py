@@ -257,6 +257,7 @@ def test_leaving_out_the_motion_gives_a_wrong_answer(
     assert fifth.clearance.lower_m > 0.05
 
 
+@pytest.mark.slow
 def test_a_mount_calibrated_from_noisy_boards_gives_the_same_answers(
     scene: Path, engine: Engine, tmp_path: Path, results: list[FrameResult]
 ) -> None:
@@ -455,6 +456,7 @@ def test_the_local_origin_is_that_of_the_whole_recording(
         np.testing.assert_array_equal(views.img_from_local[:3], chain.views.img_from_local[:3])
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 def test_engines_that_keep_things_from_frame_to_frame_agree(chain: Chain, engine: Engine) -> None:
     from hybridve.hull.query.compute import Compute
@@ -526,6 +528,7 @@ def test_stored_silhouettes_serve_until_the_poses_change(
     )
 
 
+@pytest.mark.slow
 def test_spacing_sweep_and_pictures_see_the_cameras_where_they_were(
     chain: Chain, scene: Path, engine: Engine
 ) -> None:

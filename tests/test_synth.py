@@ -212,6 +212,7 @@ def test_the_shadow_of_a_ball_lies_in_line_with_the_lamp_and_is_soft() -> None:
     assert 0.6 * ring < penumbra < 1.1 * ring
 
 
+@pytest.mark.slow
 def test_shadows_lie_on_the_floor_where_cameras_see_it() -> None:
     stage = PRESETS["boxes"].make_stage()
     x, y = np.meshgrid(np.linspace(-0.3, 0.9, 9), np.linspace(-0.3, 0.7, 9))

@@ -93,6 +93,7 @@ def test_a_thing_far_away_may_move_as_it_likes() -> None:
     assert entry.moment == pytest.approx((0.35 - RADIUS_M - 0.1) / 0.4, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_the_pushed_block_meets_the_virtual_ball_when_its_eased_way_says() -> None:
     stage = PRESETS["ball"].make_stage()
 

@@ -142,6 +142,7 @@ def page_of(
 # --- The page ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_certificate_says(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -241,6 +242,7 @@ def test_one_camera_has_a_page_without_millimetres(tmp_path: Path) -> None:
     assert len(page.images()) == 2  # no map
 
 
+@pytest.mark.slow
 def test_a_camera_that_saw_nothing_and_points_without_numbers_are_told(tmp_path: Path) -> None:
     rig, _, seen, volume = case_of(["blind", "half"])
     certificate = certify(rig, record_of(rig), {"half": seen["half"]}, volume)
@@ -417,6 +419,7 @@ def arrows_of(figure: Figure) -> dict[str, Quiver]:
     return {"orange" if one.get_facecolor()[0][0] > 0.5 else "blue": one for one in found}
 
 
+@pytest.mark.slow
 def test_arrows_are_as_long_as_is_said_and_patterns_stand_out(
     two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume],
 ) -> None:
@@ -532,6 +535,7 @@ def row_of(count: int) -> list[Camera]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [draw_rig, draw_errors])
 @pytest.mark.parametrize("cameras", [ring(BOARD, ["PINHOLE"] * 16), row_of(6)], ids=["ring", "row"])
 def test_the_names_of_many_cameras_can_be_read_from_above(

@@ -122,12 +122,7 @@ class SilhouetteWriter:
         except OSError as failure:
             raise self._unwritable(failure) from failure
 
-    def _finish(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
             self._file.close()
             return

@@ -288,7 +288,7 @@ _VERDICT: "tuple[Column[Finding], ...]" = (
         "there; kept: proved to keep its distance",
         str,
         lambda finding: finding.verdict,
-        absent=lambda result: "unknown",
+        absent=lambda _: "unknown",
     ),
     Column(
         "reason",

@@ -139,6 +139,7 @@ def about(rng: np.random.Generator, corners: NDArray[np.float64], n: int) -> NDA
 KINDS = ["sliver", "collinear", "needle", "line", "point", "speck"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_slivers_lines_and_points_are_measured_as_exactly(kind: str) -> None:
     rng = np.random.default_rng([11, KINDS.index(kind)])
@@ -254,6 +255,7 @@ def test_winding_numbers_are_those_of_rational_arithmetic(seed: int) -> None:
     assert {-1, 0, 1, 2} <= numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_sides_do_not_depend_on_the_points_before(seed: int) -> None:
     """Sides are taken over from point to point where no surface is between."""

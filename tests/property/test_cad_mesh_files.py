@@ -332,6 +332,7 @@ def test_assimp_places_fbx_models_where_we_do(folder: Path, inner: str, outer: s
     assert len(peer) == len(corners)
 
 
+@pytest.mark.slow
 def test_pycollada_and_open3d_count_what_we_count_of_what_they_read(folder: Path) -> None:
     """Triangles alone: what they make of other polygons is what they are not asked for."""
     import collada

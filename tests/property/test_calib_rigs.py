@@ -287,7 +287,7 @@ def test_cameras_are_taken_from_a_rig_with_their_share_of_the_covariance(
     with tempfile.TemporaryDirectory() as folder:
         write_rig(Path(folder) / "rig.json", rig)
         taken = read_any_rig(Path(folder) / "rig.json", names=names)
-        sizes = {name: (640, 480) for name in names}
+        sizes = dict.fromkeys(names, (640, 480))
         imported = import_rig(Path(folder), "rig.json", None, None, sizes, None)
 
     assert rig_to_dict(taken) == rig_to_dict(imported) == rig_to_dict(rig.only(names))

@@ -87,6 +87,7 @@ def _random_hull(rng: np.random.Generator) -> Hull:
     return make_hull(views, random_masks(rng, views, list(rng.choice(MASK_KINDS, n_cameras))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_no_point_of_any_hull_is_nearer_than_the_lower_bound(seed: int) -> None:
     """Blobs, holes, noise, half images, abstaining cameras: nothing about the hull is known."""
