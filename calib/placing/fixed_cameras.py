@@ -261,7 +261,12 @@ def make_bundle(
     linked: Linked,
     requests: Mapping[str, LensRequest],
 ) -> Bundle:
-    """Return the start of the joint adjustment; its frame is that of the body most cameras saw."""
+    """Return the start of the joint adjustment; its frame is that of the body most cameras saw.
+
+    Poses of bodies from all cameras at once (COLMAP's generalized absolute pose) start nearer, by
+    an eighth to a third of the residuals, but take longer than the steps of COLMAP's adjustment,
+    of which they save none.
+    """
     held, _, _ = SeenBoards(
         boards, linked.body_from_board, linked.rig_from_body, linked.pose_names, linked.views
     ).main()
