@@ -3,6 +3,9 @@
 ::
 
     lenses, Observations -> labels -> linked cameras -> joint adjustment -> world -> covariance
+
+COLMAP's adjustment comes first, wherever it can express what is to be adjusted; ours starts from
+its answer, and adds the noise by kind of view, boards on bodies, shared lenses and the covariance.
 """
 
 import logging
@@ -23,11 +26,13 @@ from hybridve.calib.placing.link import Linked, link_cameras
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.placing.world import Mark, SeenBoards, place_world
 from hybridve.calib.pose import Pose, compose, invert
-from hybridve.calib.rig import RigCovariance
+from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose
+from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.consensus import common_pose
 from hybridve.calib.solving.covariance import (
     Noise,
+    even_covariance,
     in_world,
     measure_group_noise,
     measure_noise,
@@ -68,7 +73,11 @@ _LEAST_SIGMA_PX = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """Fixed cameras in the world, and what they were adjusted to."""
+    """Fixed cameras in the world, and what they were adjusted to.
+
+    `second` is the same rig as COLMAP's own adjustment has it, with the covariance that this has
+    for the noise that was found; or why there is none, as a sentence.
+    """
 
     adjusted: Adjusted
     linked: Linked
@@ -77,6 +86,7 @@ class Solved:
     covariance: RigCovariance
     world_from_rig: Pose
     outliers: list[dict[str, Any]]
+    second: Rig | str
 
 
 def solve_fixed(
@@ -122,14 +132,18 @@ def solve_fixed(
         about["labelling"] = {"looks": looks, "decided_by": "poses common to all frames"}
     linked = link_cameras(boards, lenses, seen, is_labelled=is_still)
     bundle = make_bundle(boards, lenses, linked, requests)
-    rough = adjust(bundle, settings.lens.loss_px)
+    first = colmap_adjust(bundle, settings.lens.loss_px)
+    rough = adjust(bundle if isinstance(first, str) else first, settings.lens.loss_px)
     if is_still:
         _refuse_wrong_clips(rough, linked)
     linked = replace(
         linked, warnings=(*linked.warnings, *_disagreeing(boards, lenses, linked, rough))
     )
     cleaned, outliers = without_outliers(rough)
-    adjusted, noise, groups = adjust_weighed(cleaned, linked, shares)
+    theirs = colmap_adjust(cleaned)
+    adjusted, noise, groups = adjust_weighed(
+        cleaned if isinstance(theirs, str) else theirs, linked, shares
+    )
     about["noise_by_group"] = {name: asdict(told) for name, told in groups.items()}
     placed = place_world(
         settings.world,
@@ -140,22 +154,48 @@ def solve_fixed(
     about["world"] = placed.diagnostics
     for warning in placed.diagnostics["warnings"]:
         logger.warning("%s", warning)
-    rig_from_world = invert(placed.world_from_rig)
-    in_the_world = tuple(
-        replace(camera, cam_from_world=_rigid(compose(camera.cam_from_world, rig_from_world)))
-        for camera in adjusted.bundle.cameras
-    )
-    covariance = rig_covariance(adjusted, 1.0)
+    in_the_world = _in_world(adjusted.bundle.cameras, placed.world_from_rig)
+    covariance, even = rig_covariance(adjusted, 1.0), even_covariance(adjusted.bundle)
     if settings.world != "board":
-        # The board is held, and so without error; a world found by the cameras shares theirs.
-        covariance = in_world(
-            covariance,
-            in_the_world,
-            *_world_errors(boards, linked, adjusted.bundle, covariance, settings),
+        # The board is held, and so without error; a world found by the cameras shares theirs. Both
+        # adjustments have the same clicks.
+        by_parameter, of_clicks = _world_errors(
+            boards, linked, adjusted.bundle, covariance, settings
         )
+        covariance = in_world(covariance, in_the_world, by_parameter, of_clicks)
+        even = in_world(even, in_the_world, by_parameter, np.zeros_like(of_clicks))
+    second: Rig | str
+    if isinstance(theirs, str):
+        second = theirs
+    else:
+        world_from_rig = _world_of(boards, linked, theirs, settings, placed.world_from_rig)
+        second = Rig(_in_world(theirs.cameras, world_from_rig), covariance=even)
     return Solved(
-        adjusted, linked, noise, in_the_world, covariance, placed.world_from_rig, outliers
+        adjusted, linked, noise, in_the_world, covariance, placed.world_from_rig, outliers, second
     )
+
+
+def _in_world(cameras: Sequence[Camera], world_from_rig: Pose) -> tuple[Camera, ...]:
+    rig_from_world = invert(world_from_rig)
+    return tuple(
+        replace(camera, cam_from_world=_rigid(compose(camera.cam_from_world, rig_from_world)))
+        for camera in cameras
+    )
+
+
+def _world_of(
+    boards: Sequence[Board],
+    linked: Linked,
+    bundle: Bundle,
+    settings: CalibrationSettings,
+    otherwise: Pose,
+) -> Pose:
+    """Return the world that another adjustment has; where it has none, as we have it."""
+    seen = _seen_boards(boards, linked, bundle)
+    try:
+        return place_world(settings.world, bundle.cameras, seen, settings.marks).world_from_rig
+    except CalibrationError:
+        return otherwise  # a camera under the floor: it shows in the comparison
 
 
 def adjust_weighed(

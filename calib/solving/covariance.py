@@ -259,7 +259,11 @@ def even_covariance(bundle: Bundle) -> RigCovariance:
     variance = float(np.mean([view.sigma_px**2 for view in bundle.views]))
     prior = np.diag(_prior(bundle, layout)) * variance
     inverse = _inverted(information + prior)
-    return _of_rig(bundle, layout, inverse @ (spread + variance * prior) @ inverse)
+    # As a square, which rounding leaves positive where the pictures tell next to nothing.
+    scale = np.sqrt(np.diag(information + prior))
+    values, vectors = np.linalg.eigh((spread + variance * prior) / np.outer(scale, scale))
+    root = (inverse * scale) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return _of_rig(bundle, layout, root @ root.T)
 
 
 def _prior(bundle: Bundle, layout: Layout) -> NDArray[np.float64]:
