@@ -15,7 +15,6 @@ Seeing (`observe_boards`) and solving (`solve_rig`) are apart, so that pictures 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -24,14 +23,17 @@ from hybridve.calib.camera import N_PARAMS
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.judging.account import Calibration, put_together
-from hybridve.calib.placing.clock import estimate_offsets, noise_shares, resampled
+from hybridve.calib.placing.board_tracks import noise_shares
+from hybridve.calib.placing.clock import estimate_offsets, resampled
 from hybridve.calib.placing.fixed_cameras import make_bundle, solve_fixed
 from hybridve.calib.placing.link import link_cameras
 from hybridve.calib.placing.moving_cameras import mount
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.pose import Pose
+from hybridve.calib.record import ClocksRecord
 from hybridve.calib.seeing.corner_cache import CornerCache
-from hybridve.calib.seeing.observe import CameraInput, observe_boards
+from hybridve.calib.seeing.inputs import CameraInput
+from hybridve.calib.seeing.observe import observe_boards
 from hybridve.calib.solving.bundle import adjust
 from hybridve.calib.solving.lens_choice import choose_shared_lens
 from hybridve.calib.solving.lens_fit import FittedLens, LensSettings, fit_shared_lens
@@ -120,20 +122,20 @@ def solve_rig(
     boards, ordered = _boards_by_name(boards, ordered)
     fixed = [seen for seen in ordered if seen.name not in tracks]
     moving = [seen for seen in ordered if seen.name in tracks]
-    about: dict[str, Any] = {}
+    clocks = None
     shares: dict[str, float] = {}
     if settings.sync == "estimate" and fixed:
-        fixed, shares = _synchronised(boards, fixed, settings, requests, about)
+        fixed, shares, clocks = _synchronised(boards, fixed, settings, requests)
     lenses = _fit_lenses(boards, [*fixed, *moving], settings.lens, requests, report)
     report("adjusting everything", 0, 1)
     solved = None
     if fixed:
-        solved = solve_fixed(boards, fixed, lenses[: len(fixed)], requests, settings, about, shares)
+        solved = solve_fixed(boards, fixed, lenses[: len(fixed)], requests, settings, shares)
     mounted = [
         mount(boards, seen, lens, tracks[seen.name], solved)
         for seen, lens in zip(moving, lenses[len(fixed) :], strict=True)
     ]
-    calibration = put_together(boards, [*fixed, *moving], lenses, solved, mounted, about, settings)
+    calibration = put_together(boards, [*fixed, *moving], lenses, solved, mounted, clocks, settings)
     report("adjusting everything", 1, 1)
     names = [seen.name for seen in observations]
     return replace(calibration, rig=calibration.rig.only(names))
@@ -239,9 +241,11 @@ def _synchronised(
     observations: Sequence[Observations],
     settings: CalibrationSettings,
     requests: Mapping[str, LensRequest],
-    about: dict[str, Any],
-) -> tuple[list[Observations], dict[str, float]]:
-    """Return observations as clocks that agree would have made them, and their `noise_shares`."""
+) -> tuple[list[Observations], dict[str, float], ClocksRecord]:
+    """Return observations as clocks that agree would have made them, and their `noise_shares`.
+
+    Also returns by how much the clocks were found to be late.
+    """
     if all(seen.is_still for seen in observations):
         raise CalibrationError(
             "the cameras' clocks cannot be compared: the boards lie still in the clip; record a "
@@ -261,19 +265,6 @@ def _synchronised(
             for lens, camera in zip(lenses, rough.bundle.cameras, strict=True)
         ]
         clocks = estimate_offsets(boards, lenses, observations)
-    about["clocks"] = {
-        "reference": clocks.reference,
-        "offset_frames": {
-            name: round(offset, 4) if np.isfinite(offset) else None
-            for name, offset in clocks.offset_frames.items()
-        },
-        "std_frames": {
-            name: round(std, 4) if np.isfinite(std) else None
-            for name, std in clocks.std_frames.items()
-        },
-        "notes": list(clocks.notes),
-        "views_left_out": {name: list(instants) for name, instants in clocks.left_out.items()},
-    }
     for note in clocks.notes:
         logger.warning("clocks: %s; it is taken to be in time", note)
     for name, instants in clocks.left_out.items():
@@ -290,14 +281,29 @@ def _synchronised(
         for name, offset in clocks.offset_frames.items()
         if clocks.is_known[name] and name != clocks.reference
     ]
+    advice = None
     if late:
-        about["clocks"]["advice"] = (
+        advice = (
             f"frames by which cameras are later than {clocks.reference}: {', '.join(late)}; these "
             "hold for the board clip; where they hold for the recording, say "
             "offset_s = frames / fps"
         )
-        logger.info("clocks: %s", about["clocks"]["advice"])
+        logger.info("clocks: %s", advice)
     return (
         resampled(observations, clocks.offset_frames, boards),
         noise_shares(observations, clocks.offset_frames),
+        ClocksRecord(
+            reference=clocks.reference,
+            offset_frames=_rounded(clocks.offset_frames),
+            std_frames=_rounded(clocks.std_frames),
+            notes=clocks.notes,
+            views_left_out=clocks.left_out,
+            advice=advice,
+        ),
     )
+
+
+def _rounded(frames: Mapping[str, float]) -> dict[str, float | None]:
+    return {
+        name: round(number, 4) if np.isfinite(number) else None for name, number in frames.items()
+    }

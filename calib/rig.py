@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +9,8 @@ from numpy.typing import NDArray
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.record import MadeElsewhere, Provenance
+from hybridve.calib.verdict import RigTest
 
 #: The names of a camera's pose parameters, in the order in which a covariance has them.
 POSE_PARAMETERS = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -121,14 +122,17 @@ class Rig:
     ----------
     cameras : tuple of Camera
         At least one; names are unique.
-    provenance : dict
-        What made the rig, as plain JSON values: the method, its inputs, and reprojection errors
-        per camera. Written into rig.json and the report as it stands.
+    provenance : CalibrationRecord or MadeElsewhere
+        What made the rig: what its calibration by this program decided and doubted, or that it was
+        made elsewhere, of which nothing is known. Written into rig.json and the report.
     covariance : RigCovariance or None
         How far the parameters can be trusted; None where nobody knows.
     mounts : mapping of str to Mount
         The cameras that move with a tracker. Their `cam_from_world` is that of one moment only;
         `at` gives that of another.
+    check : RigTest or None
+        What the boards of the session that uses it say of it; None where nobody asked. Written
+        into rig.json and the report, with the provenance.
 
     Raises
     ------
@@ -138,9 +142,10 @@ class Rig:
     """
 
     cameras: tuple[Camera, ...]
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=MadeElsewhere)
     covariance: RigCovariance | None = None
     mounts: Mapping[str, Mount] = field(default_factory=dict)
+    check: RigTest | None = None
 
     def __post_init__(self) -> None:
         if not self.cameras:
@@ -203,7 +208,7 @@ class Rig:
                 tuple(covariance.labels[row] for row in rows), covariance.matrix[np.ix_(rows, rows)]
             )
         mounts = {name: mount for name, mount in self.mounts.items() if name in names}
-        return Rig(cameras, self.provenance, covariance, mounts)
+        return replace(self, cameras=cameras, covariance=covariance, mounts=mounts)
 
     def at(self, tracking_from_tracker: Mapping[str, Pose]) -> "Rig":
         """Return the rig with moving cameras where their trackers report them to be.
@@ -238,7 +243,7 @@ class Rig:
             else camera
             for camera in self.cameras
         )
-        return Rig(cameras, self.provenance, self.covariance, self.mounts)
+        return replace(self, cameras=cameras)
 
 
 def _n_parameters(camera: Camera) -> int:

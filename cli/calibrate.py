@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridve.cli import options
-from hybridve.cli.progress import StageProgress
+from hybridve.cli.progress import Terminal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 
     from hybridve.calib.judging.account import Calibration
     from hybridve.calib.judging.certificate import Certificate, SeenPoints, Volume
-    from hybridve.calib.judging.check import RigCheck
+    from hybridve.calib.record import CalibrationRecord, CameraRecord
     from hybridve.calib.rig import Rig
+    from hybridve.calib.verdict import RigCheck
     from hybridve.hull.capture.session import Session
 
     Box = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -130,16 +131,16 @@ def calibrate(
     from hybridve.hull.capture.session import load_session
 
     loaded = load_session(session)
-    stages = StageProgress(enabled=progress)
+    terminal = Terminal(enabled=progress)
     if checked is not None:
-        _check(loaded, checked, rig_unit, stages, as_json=as_json)
+        _check(loaded, checked, rig_unit, terminal, as_json=as_json)
         return
     if rig_unit is not None:
         raise click.UsageError("--rig-unit goes with --check")
     _calibrate(
         loaded,
         output or loaded.folder / "rig",
-        stages,
+        terminal,
         box_world=box_world,
         max_error_m=None if max_error_mm is None else max_error_mm / 1000.0,
         with_page=not no_page,
@@ -152,7 +153,7 @@ def calibrate(
 
 
 def _check(
-    session: "Session", source: Path, unit: str | None, stages: StageProgress, *, as_json: bool
+    session: "Session", source: Path, unit: str | None, terminal: Terminal, *, as_json: bool
 ) -> None:
     from hybridve.calib.formats.rigs import read_any_rig
     from hybridve.hull.capture.rig import board_sizes
@@ -162,7 +163,7 @@ def _check(
     sizes_px = set(board_sizes(session).values())
     image_size = sizes_px.pop() if len(sizes_px) == 1 else None
     rig = read_any_rig(source, unit=unit, image_size=image_size, names=names)
-    check = check_session(session, rig, stages)
+    check = check_session(session, rig, terminal.stage)
     if as_json:
         click.echo(json.dumps(_plain({"rig": str(source), **asdict(check)})))
     else:
@@ -195,7 +196,7 @@ def _plain(value: Any) -> Any:
 def _calibrate(
     session: "Session",
     folder: Path,
-    stages: StageProgress,
+    terminal: Terminal,
     *,
     box_world: "Box | None",
     max_error_m: float | None,
@@ -215,26 +216,25 @@ def _calibrate(
     refuse_existing(path, overwrite=overwrite)
     certificate = None
     if session.rig_file is not None:
-        rig = take_elsewhere(session, stages)
+        rig = take_elsewhere(session, terminal.stage)
     else:
-        calibration = calibrate_session(session, stages)
+        calibration = calibrate_session(session, terminal.stage)
         rig = calibration.rig
         volume = working_volume(rig, box_world)
         seen = {
             name: SeenPoints(pixels, calibration.residuals_px[name])
             for name, pixels in calibration.pixels.items()
         }
-        certificate = certify(rig, seen, calibration.noise, volume)
+        certificate = certify(rig, calibration.record, seen, volume)
         _write_certificate(
             folder, session, calibration, certificate, seen, volume, max_error_m, with_page
         )
     write_colmap_model(folder / "colmap", rig)
     write_rig(path, rig)
-    numbers = _numbers(path, rig, certificate)
     if as_json:
-        click.echo(json.dumps(_plain(numbers)))
+        click.echo(json.dumps(_plain(_numbers(path, rig, certificate))))
     else:
-        _print(numbers, certificate)
+        _print(path, rig, certificate)
     if max_error_m is not None:
         _gate(certificate, max_error_m)
 
@@ -257,6 +257,7 @@ def _write_certificate(
     if not with_page:
         page.unlink(missing_ok=True)  # one of an older rig would be believed
         return
+    from hybridve.calib.plain import to_plain
     from hybridve.hull.view.certificate_page import write_certificate_page
 
     write_certificate_page(
@@ -266,7 +267,7 @@ def _write_certificate(
         seen,
         volume,
         title=session.name,
-        details=calibration.rig.provenance,
+        details=to_plain(calibration.record),
         max_error_m=max_error_m,
     )
 
@@ -289,7 +290,10 @@ def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
 
 def _numbers(path: Path, rig: "Rig", certificate: "Certificate | None") -> dict[str, Any]:
     """Return what to tell of a rig, as plain JSON values."""
-    centers = rig.centers_world
+    from hybridve.calib.plain import to_plain
+
+    record = _record_of(rig)
+    told: dict[str, Any] = {} if record is None else to_plain(record)
     numbers: dict[str, Any] = {
         "rig": str(path),
         "cameras": [
@@ -297,62 +301,89 @@ def _numbers(path: Path, rig: "Rig", certificate: "Certificate | None") -> dict[
                 "name": camera.name,
                 "model": camera.model,
                 "center_m": camera.center_world.tolist(),
-                **rig.provenance.get("cameras", {}).get(camera.name, {}),
+                **told.get("cameras", {}).get(camera.name, {}),
             }
             for camera in rig.cameras
         ],
-        "distances_m": {
-            f"{rig.cameras[i].name} {rig.cameras[j].name}": math.dist(centers[i], centers[j])
-            for i, j in combinations(range(len(centers)), 2)
-        },
+        "distances_m": _distances_m(rig),
         **{
-            key: rig.provenance[key]
-            for key in ("world", "rms_px", "labelling", "clocks", "adjustment", "check")
-            if key in rig.provenance
+            key: told[key]
+            for key in ("world", "rms_px", "labelling", "clocks", "adjustment")
+            if key in told
         },
     }
+    if rig.check is not None:
+        numbers["check"] = rig.check.to_dict()
     if certificate is not None:
         numbers["certificate"] = certificate.to_dict()
     return numbers
 
 
-def _print(numbers: dict[str, Any], certificate: "Certificate | None") -> None:
-    from hybridve.calib.judging.certificate import millimetres
+def _record_of(rig: "Rig") -> "CalibrationRecord | None":
+    """Return what is known of a rig's calibration; None where it was made elsewhere."""
+    from hybridve.calib.record import CalibrationRecord
 
+    return rig.provenance if isinstance(rig.provenance, CalibrationRecord) else None
+
+
+def _distances_m(rig: "Rig") -> dict[str, float]:
+    """Return the distance of each two cameras, "cam1 cam2"."""
+    centers = rig.centers_world
+    return {
+        f"{rig.cameras[i].name} {rig.cameras[j].name}": math.dist(centers[i], centers[j])
+        for i, j in combinations(range(len(centers)), 2)
+    }
+
+
+def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
+    from hybridve.calib.judging.certificate import millimetres, opinion_text
+
+    record = _record_of(rig)
     if certificate is not None:
         click.echo(certificate.verdict)
-    click.echo(f"{numbers['rig']}: {len(numbers['cameras'])} cameras")
-    told = {} if certificate is None else {one.name: one for one in certificate.cameras}
-    for camera in numbers["cameras"]:
-        x, y, z = camera["center_m"]
+    click.echo(f"{path}: {len(rig.cameras)} cameras")
+    certified = {} if certificate is None else {one.name: one for one in certificate.cameras}
+    for camera in rig.cameras:
+        x, y, z = camera.center_world
         place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) m"
-        if camera["name"] in told:
-            place += f" +- {millimetres(told[camera['name']].place_std_m)} mm"
-        parts = [f"  {camera['name']}: {camera['model']}, {place}"]
-        for kind, what in (("intrinsics", "stills"), ("extrinsics", "board clip")):
-            found = camera.get(kind, {})
-            if found.get("rms_px") is not None:
-                parts.append(f"{what} {found['rms_px']:.3f} px rms of {found['views_used']} views")
-        dropped = camera.get("intrinsics", {}).get("views_dropped", {})
-        without = camera.get("intrinsics", {}).get("views_without_board", {})
-        if dropped or without:
-            parts.append(f"{len(dropped)} views dropped, {len(without)} without a board")
-        click.echo("; ".join(parts))
-        if "model_chosen" in camera:
-            click.echo(f"    {camera['model_chosen']['reason']}")
-        for remark in (*camera.get("warnings", ()), *_counted(camera.get("notes", ()))):
-            click.echo(f"    {remark}")
-    pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in numbers["distances_m"].items())
+        if camera.name in certified:
+            place += f" +- {millimetres(certified[camera.name].place_std_m)} mm"
+        told = None if record is None else record.cameras.get(camera.name)
+        click.echo("; ".join([f"  {camera.name}: {camera.model}, {place}", *_views_of(told)]))
+        if told is not None:
+            if told.model_chosen is not None:
+                click.echo(f"    {told.model_chosen.reason}")
+            for remark in (*told.warnings, *_counted(told.notes)):
+                click.echo(f"    {remark}")
+    pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in _distances_m(rig).items())
     if pairs:
         click.echo(f"  distances, m: {pairs}")
-    if "rms_px" in numbers:
-        outliers = numbers.get("adjustment", {}).get("outliers", 0)
+    if record is not None:
+        outliers = 0 if record.adjustment is None else record.adjustment.outliers
         left_out = f", {outliers} outliers left out" if outliers else ""
-        click.echo(f"  joint adjustment: {numbers['rms_px']:.3f} px rms over all views{left_out}")
-    _print_decisions(numbers)
+        click.echo(f"  joint adjustment: {record.rms_px:.3f} px rms over all views{left_out}")
+        _print_decisions(record)
+    if rig.check is not None:
+        click.echo(f"  {rig.check.message}")
     if certificate is not None:
+        if certificate.second_opinion is not None:
+            click.echo(f"  {opinion_text(certificate.second_opinion)}")
         for warning in certificate.warnings:
             click.echo(f"  {warning}")
+
+
+def _views_of(told: "CameraRecord | None") -> list[str]:
+    """Return what is to be told of the views of one camera."""
+    if told is None:
+        return []
+    parts = []
+    for found, what in ((told.intrinsics, "stills"), (told.extrinsics, "board clip")):
+        if found.rms_px is not None:
+            parts.append(f"{what} {found.rms_px:.3f} px rms of {found.views_used} views")
+    dropped, without = told.intrinsics.views_dropped, told.intrinsics.views_without_board
+    if dropped or without:
+        parts.append(f"{len(dropped)} views dropped, {len(without)} without a board")
+    return parts
 
 
 def _counted(notes: Sequence[str]) -> list[str]:
@@ -361,26 +392,24 @@ def _counted(notes: Sequence[str]) -> list[str]:
     return [f"{count} views: {what}" for what, count in sorted(counts.items())]
 
 
-def _print_decisions(numbers: dict[str, Any]) -> None:
-    """Tell what was decided on the way: the world, symmetric boards, clocks, a check."""
-    if "world" in numbers:
-        click.echo(f"  the world: {numbers['world']['text']}")
-    labelling = numbers.get("labelling", {})
-    if "weakest_sigma" in labelling:
+def _print_decisions(record: "CalibrationRecord") -> None:
+    """Tell what was decided on the way: the world, symmetric boards, clocks."""
+    if record.world is not None:
+        click.echo(f"  the world: {record.world.text}")
+    labelling = record.labelling
+    if labelling is not None and labelling.weakest_sigma is not None:
         click.echo(
             "  the board looks the same turned; which way round each camera saw it was decided by "
-            f"{labelling['decided_by']}, by {labelling['weakest_sigma']:.1f} standard deviations "
-            f"or more{' (weak: compare a distance you know)' if labelling.get('is_weak') else ''}"
+            f"{labelling.decided_by}, by {labelling.weakest_sigma:.1f} standard deviations "
+            f"or more{' (weak: compare a distance you know)' if labelling.is_weak else ''}"
         )
-    if "clocks" in numbers:
-        clocks = numbers["clocks"]
+    clocks = record.clocks
+    if clocks is not None:
         late = ", ".join(
-            f"{name} {offset:+.2f} +- {clocks['std_frames'][name]:.2f}"
+            f"{name} {offset:+.2f} +- {clocks.std_frames[name]:.2f}"
             if offset is not None
             else f"{name} unknown"
-            for name, offset in clocks["offset_frames"].items()
-            if name != clocks["reference"]
+            for name, offset in clocks.offset_frames.items()
+            if name != clocks.reference
         )
-        click.echo(f"  clocks, frames late against {clocks['reference']}: {late}")
-    if "check" in numbers:
-        click.echo(f"  {numbers['check']['message']}")
+        click.echo(f"  clocks, frames late against {clocks.reference}: {late}")

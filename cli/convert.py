@@ -118,7 +118,7 @@ def convert(
         numbers = {
             "files": [str(path) for path in written.files],
             "format": to,
-            "from_format": found.provenance.get("format", "json"),
+            "from_format": found.provenance.format,
             "cameras": [camera.name for camera in found.cameras],
             "approximated": written.approximated,
             "lost": list(written.lost),

@@ -2,22 +2,18 @@
 
 import json
 import sys
-from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from hybridve.cli import options
-from hybridve.cli.progress import StageProgress, progress_bar
+from hybridve.cli.progress import Terminal
 from hybridve.hull.contact.verdict import VERDICTS
 
 if TYPE_CHECKING:
-    from hybridve.hull.cad.scene import Scene
     from hybridve.hull.capture.recording import FrameRange
-    from hybridve.hull.capture.session import Session
-    from hybridve.hull.evaluate import Chain, EvaluateSettings
+    from hybridve.hull.report.compare import Pair
 
 #: The table of several sessions or layouts, in the folder of their reports.
 COMPARISON = "COMPARISON.csv"
@@ -112,172 +108,59 @@ def detect(
     import cv2
 
     from hybridve.cli.summary import print_summary
-    from hybridve.hull.cad.scene import load_scene
-    from hybridve.hull.capture.session import load_session
-    from hybridve.hull.evaluate import make_chain
+    from hybridve.hull.batch import DetectSettings, detect_every, detect_one
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.summarize import failing, summarize
-    from hybridve.hull.report.write import refuse_existing
 
     # Cameras run side by side in threads of their own; threads inside each would fight them.
     cv2.setNumThreads(1)
-    settings = options.evaluation_of(
-        frames=frames,
-        viewport=None if accuracy_mm is not None else viewport or 10,
-        accuracy_m=None if accuracy_mm is None else accuracy_mm / 1000.0,
-        open_at_m=open_at_mm / 1000.0 or None,
-        **response,
+    settings = DetectSettings(
+        options.evaluation_of(
+            frames=frames,
+            viewport=None if accuracy_mm is not None else viewport or 10,
+            accuracy_m=None if accuracy_mm is None else accuracy_mm / 1000.0,
+            open_at_m=open_at_mm / 1000.0 or None,
+            **response,
+        ),
+        engine=engine,
+        points=points,
+        resume=resume,
+        overwrite=overwrite,
+        command=options.command_line(),
     )
-    how = _How(settings, engine, resume, overwrite, progress, points)
+    terminal = Terminal(enabled=progress)
     if len(sessions) > 1 or len(scenes) > 1:
-        clashes = _detect_all(sessions, scenes, output, how, let_pass, as_json=as_json)
+        table = output / COMPARISON
+        named = _named(sessions, "session.toml"), _named(scenes, "scene.toml")
+        pairs = detect_every(*named, output, table, settings, terminal)
+        _tell_all(table, pairs, as_json=as_json)
+        found = [pair.summary for pair in pairs if pair.summary is not None]
     else:
-        refuse_existing(output, overwrite=overwrite)
-        told = StageProgress(enabled=progress)
-        chain = make_chain(load_session(sessions[0]), load_scene(scenes[0]), settings, told)
-        _write_report(chain, output, how)
+        detect_one(sessions[0], scenes[0], output, settings, terminal)
         report = read_report(output)
-        numbers = summarize(report)
-        clashes = bool(failing(numbers, let_pass))
+        found = [summarize(report)]
         if as_json:
-            click.echo(json.dumps(numbers))
+            click.echo(json.dumps(found[0]))
         else:
             print_summary(report)
-    if fail_on_clash and clashes:
+    if fail_on_clash and any(failing(numbers, let_pass) for numbers in found):
         sys.exit(3)
 
 
-@dataclass(frozen=True, slots=True)
-class _How:
-    """What is the same for all sessions and layouts."""
-
-    settings: "EvaluateSettings"
-    engine: options.EngineName
-    resume: bool
-    overwrite: bool
-    progress: bool
-    points: Literal["sample", "all"]
-
-
-def _write_report(chain: "Chain", output: Path, how: _How) -> None:
-    """Evaluate one recording against one scene into a report."""
-    from hybridve.hull.evaluate import (
-        about_objects,
-        about_rig,
-        computed_parts,
-        count_frames,
-        evaluate,
-        local_origin_m,
-        resolved_settings,
-        stored_meshes,
-    )
-    from hybridve.hull.query.choose import open_engine
-    from hybridve.hull.report.machine import machine_text, software_versions
-    from hybridve.hull.report.schema import ReportHeader
-    from hybridve.hull.report.write import ReportWriter
-
-    with open_engine(how.engine) as query:
-        header = ReportHeader(
-            command=" ".join(["hybridve", *sys.argv[1:]]),
-            objects=about_objects(chain),
-            settings=resolved_settings(chain),
-            rig=about_rig(chain),
-            engine=query.name,
-            renderer=query.renderer,
-            parts=computed_parts(chain.settings),
-            cameras=chain.views.names,
-            versions=software_versions(),
-            machine=machine_text(),
-            local_origin_m=local_origin_m(chain),
-            meshes=stored_meshes(chain),
-            points=how.points,
-        )
-        with ReportWriter(output, header, resume=how.resume, overwrite=how.overwrite) as writer:
-            total = count_frames(chain)
-            evaluation = evaluate(
-                chain,
-                query,
-                skip=writer.n_done,
-                write_s=writer.take_write_s,
-                progress=StageProgress(enabled=how.progress),
-            )
-            with (
-                closing(evaluation) as results,
-                progress_bar("detect", total, done=writer.n_done, enabled=how.progress) as advance,
-            ):
-                for result in results:
-                    writer.append(result)
-                    advance()
-            if how.progress:
-                click.echo(f"writing {output}", err=True)
-            writer.finish()
-
-
-def _detect_all(
-    sessions: tuple[Path, ...],
-    scenes: tuple[Path, ...],
-    folder: Path,
-    how: _How,
-    let_pass: tuple[str, ...],
-    *,
-    as_json: bool,
-) -> bool:
-    """Test every session against every layout; tell whether a distance is not kept.
-
-    One that fails is told and left out, and the others go on.
-    """
-    from hybridve.calib.errors import HybridveError, ReportError
-    from hybridve.hull.cad.scene import load_scene
-    from hybridve.hull.capture.session import load_session
-    from hybridve.hull.report.compare import (
-        Pair,
-        compare,
-        distinct_names,
-        report_name,
-        write_comparison,
-    )
-    from hybridve.hull.report.summarize import failing
-    from hybridve.hull.report.write import refuse_existing
+def _named(paths: tuple[Path, ...], default: str) -> dict[str, Path]:
+    """Return files by a short name for each."""
+    from hybridve.hull.report.compare import distinct_names
 
     try:
-        session_names = distinct_names(sessions, "session.toml")
-        scene_names = distinct_names(scenes, "scene.toml")
+        return dict(zip(distinct_names(paths, default), paths, strict=True))
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    table = folder / COMPARISON
-    _make_folder(folder)
-    if not how.resume:
-        for path in [
-            *(folder / report_name(one, other) for one in session_names for other in scene_names),
-            table,
-        ]:
-            refuse_existing(path, overwrite=how.overwrite)
 
-    def load(loader: Any, path: Path) -> Any:
-        try:
-            return loader(path)
-        except HybridveError as error:
-            click.echo(f"error: {error}", err=True)
-            return error
 
-    loaded_sessions = [load(load_session, path) for path in sessions]
-    loaded_scenes = [load(load_scene, path) for path in scenes]
-    pairs: list[Pair] = []
-    for name, session in zip(session_names, loaded_sessions, strict=True):
-        for layout, scene in zip(scene_names, loaded_scenes, strict=True):
-            lost = next((one for one in (session, scene) if isinstance(one, HybridveError)), None)
-            if lost is not None:
-                pairs.append(Pair(name, layout, None, str(lost)))
-                continue
-            if how.progress:
-                count = len(sessions) * len(scenes)
-                click.echo(f"{name}, {layout} ({len(pairs) + 1} of {count})", err=True)
-            path = folder / report_name(name, layout)
-            try:
-                pairs.append(Pair(name, layout, _detect_one(session, scene, path, how)))
-            except HybridveError as error:
-                click.echo(f"error: {name}, {layout}: {error}", err=True)
-                pairs.append(Pair(name, layout, None, str(error)))
+def _tell_all(table: Path, pairs: "list[Pair]", *, as_json: bool) -> None:
+    """Write the table of several reports, and print it; then say so if some are missing."""
+    from hybridve.calib.errors import ReportError
+    from hybridve.hull.report.compare import compare, write_comparison
 
     comparison = compare(pairs)
     write_comparison(table, comparison)
@@ -287,44 +170,10 @@ def _detect_all(
         _print_comparison(table, comparison)
     if comparison["failed"]:
         raise ReportError(
-            f"{folder}: {len(comparison['failed'])} of {len(pairs)} reports could not be made, as "
-            "told above; the others stand there, and the same call with --resume makes the rest"
+            f"{table.parent}: {len(comparison['failed'])} of {len(pairs)} reports could not be "
+            "made, as told above; the others stand there, and the same call with --resume makes "
+            "the rest"
         )
-    return any(failing(pair.summary, let_pass) for pair in pairs if pair.summary is not None)
-
-
-def _make_folder(folder: Path) -> None:
-    from hybridve.calib.errors import ReportError
-
-    if folder.exists() and not folder.is_dir():
-        raise ReportError(
-            f"{folder}: is a file; several sessions or layouts need a folder for their reports"
-        )
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise ReportError(f"{folder}: cannot be made: {error.strerror}") from error
-
-
-def _detect_one(session: "Session", scene: "Scene", path: Path, how: _How) -> dict[str, Any]:
-    """Return the summary of one report; one that is finished is not made again when resuming."""
-    from hybridve.calib.errors import ReportError
-    from hybridve.hull.evaluate import about_rig, make_chain, resolved_settings
-    from hybridve.hull.report.read import read_report
-    from hybridve.hull.report.summarize import summarize
-
-    chain = make_chain(session, scene, how.settings, StageProgress(enabled=how.progress))
-    if how.resume and path.exists() and not how.overwrite:
-        found = read_report(path)
-        wanted = json.loads(json.dumps([resolved_settings(chain), about_rig(chain)]))
-        if [found.settings, found.rig] != wanted:
-            raise ReportError(
-                f"{path}: was finished with other settings, another recording or another scene; "
-                "give the same again, or start anew with --overwrite"
-            )
-        return summarize(found)
-    _write_report(chain, path, how)
-    return summarize(read_report(path))
 
 
 def _print_comparison(table: Path, comparison: dict[str, Any]) -> None:

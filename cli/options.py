@@ -1,5 +1,6 @@
 """Arguments and options that commands share: the same thing has the same name everywhere."""
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
@@ -10,8 +11,8 @@ EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
+    from hybridve.hull.chain import EvaluateSettings
     from hybridve.hull.contact.uncertainty import DoubtSettings
-    from hybridve.hull.evaluate import EvaluateSettings
 
 FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
 
@@ -232,8 +233,8 @@ def evaluation_of(
     """
     from math import radians
 
+    from hybridve.hull.chain import EvaluateSettings
     from hybridve.hull.contact.respond import ResponseSettings
-    from hybridve.hull.evaluate import EvaluateSettings
 
     if backtrack and not response:
         raise click.UsageError("--backtrack says where the response begins; drop --no-response")
@@ -246,6 +247,11 @@ def evaluation_of(
         doubt=doubt_of(doubt=doubt and clearance_mm > 0, mask_std_px=mask_std_px),
         **others,
     )
+
+
+def command_line() -> str:
+    """Return what was called, for the files that it makes."""
+    return " ".join(["hybridve", *sys.argv[1:]])
 
 
 def counted(count: int, what: str) -> str:

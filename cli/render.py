@@ -49,7 +49,7 @@ def render(
     from hybridve.calib.errors import ReportError
     from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.evaluate import EvaluateSettings, make_chain
+    from hybridve.hull.chain import EvaluateSettings, make_chain
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.write import refuse_existing

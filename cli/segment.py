@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridve.cli import options
-from hybridve.cli.progress import StageProgress, progress_bar
+from hybridve.cli.progress import Terminal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -62,6 +62,7 @@ def segment(
     from hybridve.hull.report.write import refuse_existing
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
+    terminal = Terminal(enabled=progress)
     loaded = load_session(session)
     output = loaded.folder / "silhouettes.h5"
     refuse_existing(output, overwrite=overwrite)
@@ -69,17 +70,17 @@ def segment(
     check_lengths(loaded, FrameRange())
     digest, clean = None, None
     if not unconfirmed and has_rig(loaded):
-        rig = load_rig(loaded, StageProgress(enabled=progress))
+        rig = load_rig(loaded, terminal.stage)
         digest, clean = rig_digest(rig), _cleaner(loaded, rig)
 
     names = [camera.name for camera in loaded.cameras]
     object_pixels = [0] * len(names)
     n_frames, n_invalid = 0, 0
-    recording = segmented_frames(loaded, FrameRange(), progress=StageProgress(enabled=progress))
+    recording = segmented_frames(loaded, FrameRange(), progress=terminal.stage)
     with (
         closing(recording) as frames,
         SilhouetteWriter(output, names, sizes_px, silhouette_stamp(loaded, digest)) as writer,
-        progress_bar("segment", claimed_length(loaded), enabled=progress) as advance,
+        terminal.steps("segment", claimed_length(loaded)) as advance,
     ):
         for frame in frames:
             masks = frame.masks
@@ -123,7 +124,7 @@ def _cleaner(session: "Session", rig: "Rig") -> "Callable[[int, list[Mask]], lis
     """Return what drops the pieces of a frame's silhouettes that no other camera confirms."""
     from hybridve.hull.agreement.pieces import drop_unconfirmed
     from hybridve.hull.capture.tracks import read_tracks
-    from hybridve.hull.evaluate import first_rig, moved_views, rig_views
+    from hybridve.hull.chain import first_rig, moved_views, rig_views
 
     tracks = read_tracks(session, rig)
     first, lenses = rig_views(session, first_rig(rig, tracks))

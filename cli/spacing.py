@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridve.cli import options
-from hybridve.cli.progress import StageProgress, progress_bar
+from hybridve.cli.progress import Terminal
 
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
@@ -143,7 +142,7 @@ def spacing(
     from hybridve.calib.errors import SessionError
     from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.evaluate import EvaluateSettings, count_frames, make_chain
+    from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
     from hybridve.hull.report.compare import distinct_names
     from hybridve.hull.report.machine import machine_text, software_versions
     from hybridve.hull.report.spacing_file import Spacing, spacing_as_dict, write_spacing
@@ -153,6 +152,7 @@ def spacing(
     from hybridve.hull.view.chart import SUFFIXES
 
     cv2.setNumThreads(1)
+    terminal = Terminal(enabled=progress)
     if picture is not None and picture.suffix.lower() not in SUFFIXES:
         raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
     if picture is not None and picture == output:
@@ -177,7 +177,7 @@ def spacing(
 
     found = []
     for name, chain in zip(names, chains, strict=True):
-        with progress_bar(f"spacing {name}", count_frames(chain), enabled=progress) as advance:
+        with terminal.steps(f"spacing {name}", count_frames(chain)) as advance:
             found.append(
                 replay(
                     name,
@@ -185,12 +185,12 @@ def spacing(
                     layout,
                     shifts_m,
                     grow_px=grow_px,
-                    progress=StageProgress(enabled=progress),
+                    progress=terminal.stage,
                     advance=advance,
                 )
             )
     result = Spacing(
-        command=" ".join(["hybridve", *sys.argv[1:]]),
+        command=options.command_line(),
         machine=machine_text(),
         created_utc=utc_now(),
         versions=software_versions(),

@@ -1,7 +1,6 @@
 """``hybridve sweep``: accuracy against time, over viewports and engines."""
 
 import json
-import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from hybridve.cli import options
-from hybridve.cli.progress import StageProgress, progress_bar
+from hybridve.cli.progress import Terminal
 
 if TYPE_CHECKING:
     from hybridve.hull.cad.scene import Scene
@@ -136,15 +135,10 @@ def sweep(
     """
     import cv2
 
+    from hybridve.hull.about import about_objects, resolved_settings
     from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.evaluate import (
-        EvaluateSettings,
-        about_objects,
-        count_frames,
-        make_chain,
-        resolved_settings,
-    )
+    from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
     from hybridve.hull.query.certify import certify_triangles
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.machine import machine_text, software_versions
@@ -163,6 +157,7 @@ def sweep(
     from hybridve.hull.view.chart import SUFFIXES
 
     cv2.setNumThreads(1)
+    terminal = Terminal(enabled=progress)
     picture = output.with_suffix(".png") if picture is None else picture
     if picture.suffix.lower() not in SUFFIXES:
         raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
@@ -186,8 +181,8 @@ def sweep(
 
     with ExitStack() as stack:
         rooms = _open_rooms(engines, stack)
-        with progress_bar("silhouettes", count_frames(chain), enabled=progress) as advance:
-            hulls = read_hulls(chain, StageProgress(enabled=progress), advance)
+        with terminal.steps("silhouettes", count_frames(chain)) as advance:
+            hulls = read_hulls(chain, terminal.stage, advance)
         looks = samples_asked(hulls, rows) * len(chain.views) * (repeats + 1)
         if not engines and looks > _MOST_REFERENCE_LOOKS:
             rooms = [room for room in rooms if room.engine.name != "reference"]
@@ -201,7 +196,7 @@ def sweep(
         else:
             truth_room = stack.enter_context(EngineRoom(partial(open_engine, "native")))
         steps = len(hulls) + len(rows) * len(rooms) * (repeats + 1)
-        with progress_bar("sweep", steps, unit="step", enabled=progress) as advance:
+        with terminal.steps("sweep", steps, unit="step") as advance:
             outcome = run_sweep(
                 hulls,
                 rows,
@@ -216,7 +211,7 @@ def sweep(
     write_sweep(
         output,
         Sweep(
-            command=" ".join(["hybridve", *sys.argv[1:]]),
+            command=options.command_line(),
             machine=machine_text(),
             created_utc=utc_now(),
             versions=software_versions(),

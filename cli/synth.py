@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from hybridve.cli import options
-from hybridve.cli.progress import StageProgress
+from hybridve.cli.progress import Terminal
 
 
 @click.command(short_help="Generate a recording with known truth.")
@@ -69,6 +69,6 @@ def synth(
         n_frames=n_frames,
         options={name: value for name, value in chosen if value is not None},
         overwrite=overwrite,
-        progress=StageProgress(enabled=progress),
+        progress=Terminal(enabled=progress).stage,
     )
     click.echo(f"{output / 'session.toml'}")

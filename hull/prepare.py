@@ -33,7 +33,7 @@ _SIDE_PX = 64
 #: Quads along an edge of the sheet that is compiled with: enough triangles for clusters.
 _QUADS = 48
 
-#: The file that says that all is compiled.
+#: The file that says that all is compiled, and names the files that hold it, a line each.
 _SIGN = "complete"
 
 
@@ -53,7 +53,8 @@ def prepare_kernels() -> bool:
         finally:
             if collects:
                 gc.enable()
-        (FOLDER / _SIGN).touch()
+        held = sorted(str(path.relative_to(FOLDER)) for path in FOLDER.rglob("*.nbc"))
+        (FOLDER / _SIGN).write_text("\n".join(held) + "\n", encoding="utf-8")
     return is_prepared()
 
 

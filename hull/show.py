@@ -14,8 +14,8 @@ from hybridve.hull.capture.recording import (
     segmented_frames,
     undistort_mask,
 )
+from hybridve.hull.chain import Chain, views_at
 from hybridve.hull.contact.detect import Contact, detect_contacts
-from hybridve.hull.evaluate import Chain, views_at
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.view.picture import (

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
+from hybridve.hull.about import resolved_settings
 from hybridve.hull.cad.scene import Scene, SceneObject
-from hybridve.hull.capture.recording import silhouettes_of
+from hybridve.hull.chain import Chain, hulls, make_doubter
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
 from hybridve.hull.contact.spacing import (
@@ -31,8 +32,7 @@ from hybridve.hull.contact.spacing import (
 )
 from hybridve.hull.contact.spacing_doubt import UnsureShifts, unsure_shifts
 from hybridve.hull.contact.uncertainty import Doubter, FrameDoubts
-from hybridve.hull.evaluate import Chain, make_doubter, resolved_settings, views_at
-from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.report.spacing_file import (
     Binding,
     SessionSpacing,
@@ -183,27 +183,16 @@ def replay(
     """
     doubter = make_doubter(chain)
     tally = _Tally(layout, is_doubted=doubter is not None)
-    found = silhouettes_of(
-        chain.session,
-        chain.silhouettes,
-        chain.settings.frames,
-        tracks=chain.tracks,
-        undistortions=chain.undistortions,
-        progress=progress,
-    )
-    with closing(found) as silhouettes:
-        for frame in silhouettes:
-            time_s = frame.index / chain.session.fps
-            if frame.masks is None:
-                tally.leave_out(frame.index, time_s, frame.reason)
+    with closing(hulls(chain, progress=progress)) as frames:
+        for frame in frames:
+            if frame.hull is None:
+                tally.leave_out(frame.index, frame.time_s, frame.reason)
             else:
-                hull = make_hull(views_at(chain, frame.index), frame.masks)
-                if grow_px:
-                    hull = grown(hull, grow_px)
+                hull = grown(frame.hull, grow_px) if grow_px else frame.hull
                 doubts = None
                 if doubter is not None:
                     doubts = doubter.frame(hull, chain.tracks.at(frame.index))
-                tally.look(frame.index, time_s, hull, doubts)
+                tally.look(frame.index, frame.time_s, hull, doubts)
             advance()
     if not tally.n_valid:
         raise SessionError(

@@ -45,13 +45,16 @@ def pytest_configure(config: pytest.Config) -> None:
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep what tests keep away from the user's, for the session, as fixtures keep things too.
 
+    Processes side by side share it: corners that one has found spare the others the search.
     Compiled code is the user's own: it takes long, and is named after its sources.
     """
     with pytest.MonkeyPatch.context() as patch:
         compiled = cache_folder("compiled")
         if compiled is not None and "NUMBA_CACHE_DIR" not in os.environ:
             patch.setenv("NUMBA_CACHE_DIR", str(compiled))
-        patch.setenv("HYBRIDVE_CACHE", str(tmp_path_factory.mktemp("cache")))
+        mine = tmp_path_factory.getbasetemp()
+        of_all = mine.parent if "PYTEST_XDIST_WORKER" in os.environ else mine
+        patch.setenv("HYBRIDVE_CACHE", str(of_all / "cache"))
         yield
 
 

@@ -26,10 +26,12 @@ from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.rigs import rig_to_dict
 from hybridve.calib.image_io import open_source
 from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.record import provenance_from_plain
 from hybridve.calib.rig import Rig
-from hybridve.calib.seeing.observe import CameraInput, ObserveSettings
+from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 
 #: Rendered boards of 4 stills place cameras to this, by their distance from the board.
 PLACED = 0.01
@@ -106,9 +108,9 @@ def test_pictures_give_the_rig(rig: Rig) -> None:
 
 
 def test_the_provenance_is_plain_json_and_says_what_was_used(rig: Rig) -> None:
-    told = json.loads(json.dumps(rig.provenance, allow_nan=False))
+    told = json.loads(json.dumps(rig_to_dict(rig), allow_nan=False))["provenance"]
 
-    assert told == rig.provenance
+    assert provenance_from_plain(told) == rig.provenance
     left = told["cameras"]["left"]
     assert left["intrinsics"]["views_used"] == 5
     assert left["intrinsics"]["views_without_board"] == {"3.png": "no board found"}
@@ -154,7 +156,7 @@ def test_corners_marked_by_hand_serve_where_none_are_found(
 
     rig = calibrate_rig([BOARD], [left], SETTINGS).rig
 
-    assert "marked by hand" in rig.provenance["cameras"]["left"]["extrinsics"]["how"]
+    assert "marked by hand" in rig.provenance.cameras["left"].extrinsics.how
     assert any("no board found" in record.message for record in caplog.records)
     distance_m = np.linalg.norm(rig["left"].center_world - camera.center_world)
     assert distance_m < 3 * PLACED * np.linalg.norm(camera.center_world)
@@ -215,10 +217,10 @@ def test_the_floor_around_it_tells_which_way_round_a_board_was_seen(board: Chess
     rig = solve_rig([board], observations).rig
 
     np.testing.assert_allclose(distances(rig.cameras), distances(cameras), rtol=PLACED)
-    evidence = rig.provenance["labelling"]
-    assert not evidence["is_weak"]
-    assert evidence["weakest_sigma"] > 5.0
-    assert len(evidence["matches_by_look"]["cam1 cam2"]) == len(board.looks)
+    evidence = rig.provenance.labelling
+    assert not evidence.is_weak
+    assert evidence.weakest_sigma > 5.0
+    assert len(evidence.matches_by_look["cam1 cam2"]) == len(board.looks)
 
 
 def test_without_anything_around_it_the_doubt_is_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -228,7 +230,7 @@ def test_without_anything_around_it_the_doubt_is_said(caplog: pytest.LogCaptureF
     with caplog.at_level(logging.WARNING):
         rig = solve_rig([SYMMETRIC], observations).rig
 
-    assert rig.provenance["labelling"]["is_weak"]
+    assert rig.provenance.labelling.is_weak
     assert any("uncertain" in record.message for record in caplog.records)
 
 

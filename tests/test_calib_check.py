@@ -15,13 +15,14 @@ from hybridve.calib.boards.board import Board, Observations, Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.judging.check import SCALE_TOLERANCE, SIGNIFICANCE, RigCheck, check_rig
+from hybridve.calib.judging.check import SCALE_TOLERANCE, SIGNIFICANCE, check_rig
 from hybridve.calib.judging.comparison import chance_of
 from hybridve.calib.pose import compose, rotation_about_axes
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import adjust, moved_pose
 from hybridve.calib.solving.covariance import measure_noise, rig_covariance
 from hybridve.calib.solving.placement import zoomed
+from hybridve.calib.verdict import RigCheck
 
 #: Noise-free corners determine the scale to this, and reprojections in pixels.
 EXACT = 1e-6

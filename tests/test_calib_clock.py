@@ -294,10 +294,13 @@ def test_a_rig_of_late_cameras_is_solved_with_the_noise_of_frames() -> None:
         recording.boards, recording.observations, CalibrationSettings(sync="estimate")
     )
 
-    told = calibration.rig.provenance
-    assert told["clocks"]["offset_frames"] == pytest.approx(late, abs=0.05)
-    assert "cam2 +2.5" in told["clocks"]["advice"] or "cam2 +2.4" in told["clocks"]["advice"]
-    assert "offset_s" in told["clocks"]["advice"]
+    told = calibration.record
+    assert told.clocks is not None
+    assert told.clocks.advice is not None
+    assert told.noise_by_group is not None
+    assert told.clocks.offset_frames == pytest.approx(late, abs=0.05)
+    assert "cam2 +2.5" in told.clocks.advice or "cam2 +2.4" in told.clocks.advice
+    assert "offset_s" in told.clocks.advice
     # Half of all points are interpolated half-way, and so less noisy; their errors are not.
-    assert told["noise"]["smooth_px"] < 0.19
-    assert 0.18 < told["noise_by_group"]["board clip"]["smooth_px"] < 0.22
+    assert told.noise.smooth_px < 0.19
+    assert 0.18 < told.noise_by_group["board clip"].smooth_px < 0.22

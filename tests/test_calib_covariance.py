@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, project_points
+from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.placing.world import Mark
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import Adjusted, adjust, moved_pose

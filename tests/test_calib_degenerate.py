@@ -21,6 +21,7 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.rigs import rig_to_dict
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.judging.certificate import Certificate, SeenPoints, certify, working_volume
 from hybridve.calib.lens import img_from_cam
@@ -60,8 +61,8 @@ def calibrated(
         name: SeenPoints(pixels, calibration.residuals_px[name])
         for name, pixels in calibration.pixels.items()
     }
-    certificate = certify(rig, seen, calibration.noise, working_volume(rig))
-    json.dumps([certificate.to_dict(), rig.provenance], allow_nan=False)
+    certificate = certify(rig, calibration.record, seen, working_volume(rig))
+    json.dumps([certificate.to_dict(), rig_to_dict(rig)], allow_nan=False)
     return calibration, certificate
 
 
@@ -314,7 +315,7 @@ def test_cameras_in_exactly_one_place_place_no_point() -> None:
     covariance = replace(calibration.rig.covariance, labels=named)
     twice = Rig((camera, replace(camera, name="twin")), covariance=covariance)
 
-    certificate = certify(twice, {}, calibration.noise, working_volume(twice))
+    certificate = certify(twice, calibration.record, {}, working_volume(twice))
 
     assert np.isnan(certificate.error95_m)
     assert "no error in mm can be stated" in certificate.verdict
@@ -417,7 +418,7 @@ def test_a_board_in_a_corner_of_the_image_leaves_the_rest_unsure() -> None:
     one, two, _ = certificate.cameras
     assert two.coverage < one.coverage
     assert two.edge_error95_px > 1.5 * one.edge_error95_px
-    (told,) = calibration.rig.provenance["cameras"]["cam2"]["warnings"]
+    (told,) = calibration.record.cameras["cam2"].warnings
     assert "% of the image" in told
 
 
@@ -540,7 +541,7 @@ def test_the_same_sightings_twice_count_once() -> None:
 
     once, again = solve_rig([CARRIED], seen).rig, solve_rig([CARRIED], twice).rig
 
-    assert once.provenance["adjustment"]["views"] == again.provenance["adjustment"]["views"]
+    assert once.provenance.adjustment.views == again.provenance.adjustment.views
     for camera in once.cameras:
         off_m = np.linalg.norm(camera.center_world - again[camera.name].center_world)
         assert off_m < 0.01
@@ -600,7 +601,7 @@ def test_boards_back_to_back_link_cameras_that_face_each_other() -> None:
 
     calibration, certificate = calibrated(boards, seen)
 
-    instant = calibration.rig.provenance["world"]["instant"]
+    instant = calibration.record.world.instant
     true = [
         replace(camera, cam_from_world=compose(camera.cam_from_world, panel[instant]))
         for camera in cameras
@@ -667,7 +668,7 @@ def test_a_clock_that_is_late_is_found_out_where_it_is_asked_for() -> None:
 
     calibration, certificate = calibrated([CARRIED], late_by(5.0), settings)
 
-    offsets = calibration.rig.provenance["clocks"]["offset_frames"]
+    offsets = calibration.record.clocks.offset_frames
     assert abs(offsets["cam2"]) == pytest.approx(5.0, abs=0.02)
     assert offsets["cam3"] == pytest.approx(0.0, abs=0.02)
     assert not certificate.doubts
@@ -767,7 +768,7 @@ def test_what_is_left_of_a_recording_gives_an_honest_rig_or_a_reason(seed: int) 
     except CalibrationError:
         return
 
-    instant = calibration.rig.provenance["world"]["instant"]
+    instant = calibration.record.world.instant
     if certificate.doubts or not isinstance(instant, int):
         return
     count = len(seen)

@@ -96,7 +96,7 @@ def test_aniposelib_is_taken_with_the_unit_that_is_named(tmp_path: Path) -> None
 
     assert [camera.name for camera in rig.cameras] == ["left", "right"]
     assert (rig["left"].width_px, rig["left"].height_px) == (1280, 720)
-    assert rig.provenance["format"] == "aniposelib"
+    assert rig.provenance.format == "aniposelib"
     assert_images(rig["left"], opencv_pixels(MATRIX, DISTORTION, POSE, POINTS_WORLD))
     assert_images(rig["right"], opencv_pixels(MATRIX, FISHEYE, POSE, POINTS_WORLD, is_fisheye=True))
 

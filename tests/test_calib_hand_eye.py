@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.placing.hand_eye import PARAMETERS, mount_camera, solve_hand_eye
+from hybridve.calib.placing.hand_eye import PARAMETERS, mount_camera
+from hybridve.calib.placing.mount_fit import solve_hand_eye
 from hybridve.calib.pose import Pose, angle_between, compose, invert
 from hybridve.calib.rig import Mount
 
@@ -124,11 +125,11 @@ def test_boards_seen_without_noise_give_the_mount_back(seed: int) -> None:
     mount, about = walk.solved()
 
     assert apart(mount, walk.mount) < 1e-9
-    assert about["views"] == about["instants"] == 25
-    assert about["middle_instant"] == 12
-    assert about["rms_px"] < 1e-8
-    assert about["tracker_scale"] == pytest.approx(1.0, abs=1e-9)
-    assert np.abs(about["covariance"]).max() < 1e-18
+    assert about.views == about.instants == 25
+    assert about.middle_instant == 12
+    assert about.rms_px < 1e-8
+    assert about.tracker_scale == pytest.approx(1.0, abs=1e-9)
+    assert np.abs(about.covariance).max() < 1e-18
 
 
 def test_a_board_elsewhere_moves_the_trackers_world_and_not_the_offset() -> None:
@@ -159,7 +160,7 @@ def test_two_boards_in_one_world_are_used_together_and_a_third_unknown_one_is_no
     mount, about = mount_camera(CAMERA, [BOARD] * 3, [*sightings, lost], walk.tracked, places)
 
     assert apart(mount, walk.mount) < 1e-9
-    assert about["views"] == 12
+    assert about.views == 12
 
 
 def test_the_order_of_pictures_does_not_matter() -> None:
@@ -188,14 +189,14 @@ def test_errors_are_as_large_as_the_covariance_says(noise: dict[str, float]) -> 
 
         mount, about = walk.solved()
 
-        assert about["parameters"] == list(PARAMETERS)
-        squares.append(walk.errors(mount) ** 2 / np.diag(about["covariance"]))
+        assert about.parameters == PARAMETERS
+        squares.append(walk.errors(mount) ** 2 / np.diag(about.covariance))
         for instant, true in enumerate(walk.cam_from_world):
             found = mount.cam_from_world(walk.tracked[instant])
             error = np.append(
                 cv2.Rodrigues(true[:, :3] @ found[:, :3].T)[0], true[:, 3] - found[:, 3]
             )
-            pose_squares.append(error**2 / np.diag(about["pose_covariance"]))
+            pose_squares.append(error**2 / np.diag(about.pose_covariance))
     # 16 runs of 12 numbers that hang together: a mean square of 1 within about a half.
     assert 0.5 < float(np.mean(squares)) < 1.6
     # What corners add to a frame's own pose is subtracted, but not below zero.
@@ -212,7 +213,7 @@ def test_wrong_poses_and_turned_over_boards_are_dropped_and_told() -> None:
     mount, about = walk.solved(tracked=wrong)
     expected, _ = walk.solved(sightings=without)
 
-    assert sorted(about["dropped"]) == ["11.png", "17.png", "18.png", "3.png"]
+    assert sorted(about.dropped) == ["11.png", "17.png", "18.png", "3.png"]
     assert apart(mount, expected) < 1e-9
 
 
@@ -228,7 +229,7 @@ def test_corners_that_were_not_seen_do_not_count() -> None:
     mount, about = walk.solved(sightings=seen)
 
     assert apart(mount, walk.mount) < 1e-9
-    assert about["dropped"] == {"0.png": "the board cannot be located"}
+    assert about.dropped == {"0.png": "the board cannot be located"}
 
 
 def test_a_board_listed_the_other_way_round_is_listed_as_most_are() -> None:
@@ -247,8 +248,8 @@ def test_a_board_listed_the_other_way_round_is_listed_as_most_are() -> None:
 
     mount, about = mount_camera(CAMERA, [symmetric], sightings, walk.tracked)
 
-    assert about["looks_turned"] == 8
-    assert about["dropped"] == {}
+    assert about.looks_turned == 8
+    assert about.dropped == {}
     assert apart(mount, walk.mount) < 1e-9
 
 
@@ -322,7 +323,7 @@ def test_a_stuck_tracker_is_refused_and_a_stuck_spell_left_out() -> None:
         walk, tracked=dict.fromkeys(walk.tracked, walk.tracked[0])
     )
     assert apart(mount, walk.mount) < 1e-9
-    assert about["dropped"] == {
+    assert about.dropped == {
         f"{k}.png": "the tracker reports the pose of instant 10 again" for k in (11, 12, 13, 14)
     }
 

@@ -19,9 +19,12 @@ from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.placing.labelling import label_still_boards, unmirrored
-from hybridve.calib.placing.surroundings import describe_scene, with_floor
+from hybridve.calib.placing import labelling
+from hybridve.calib.placing.labelling import label_still_boards
+from hybridve.calib.placing.scene_votes import unmirrored
+from hybridve.calib.placing.surroundings import LooksByVote, describe_scene, with_floor
 from hybridve.calib.pose import compose
+from hybridve.calib.record import Labelling
 from hybridve.calib.solving.lens_fit import locate_board
 
 SIZE_PX = (320, 240)
@@ -87,7 +90,7 @@ def in_picture(seen: Observations, board: Chessboard, image: np.ndarray) -> Obse
 
 def label(
     name: str, is_mirrored: tuple[bool, ...], is_textured: bool = True
-) -> tuple[list[Observations], dict[str, object]]:
+) -> tuple[list[Observations], Labelling]:
     count = len(is_mirrored)
     cameras, seen = seen_around(name, is_textured, max(count, 3))
     picked = [index + max(count, 3) * flip for index, flip in enumerate(is_mirrored)]
@@ -135,7 +138,7 @@ def test_a_mirrored_picture_is_named(name: str) -> None:
 def test_pictures_that_agree_are_not_accused(name: str) -> None:
     labelled, evidence = label(name, (False, False, False))
 
-    assert not evidence.get("is_weak", False)
+    assert not evidence.is_weak
     if len(BOARDS[name].looks) == 1:
         given = seen_around(name, True, 3)[1]
         for one, other in zip(labelled, given[:3], strict=True):
@@ -145,14 +148,33 @@ def test_pictures_that_agree_are_not_accused(name: str) -> None:
 def test_pictures_that_are_all_mirrored_show_a_world_that_there_might_be() -> None:
     _, evidence = label("7x6", (True, True, True))
 
-    assert not evidence.get("is_weak", False)
+    assert not evidence.is_weak
 
 
 @pytest.mark.parametrize("name", ["7x6", "8x6"])
 def test_where_nothing_is_around_the_board_nobody_is_accused(name: str) -> None:
     _, evidence = label(name, (False, True), is_textured=False)
 
-    assert evidence.get("is_weak", False) == (name == "8x6")
+    # Of the one, nothing was to be decided.
+    assert evidence.is_weak is {"7x6": None, "8x6": True}[name]
+
+
+@pytest.mark.parametrize("sigmas", [(1.0, 9.0), (9.0, 1.0)])
+def test_of_two_boards_the_one_that_is_told_worse_is_doubted(
+    monkeypatch: pytest.MonkeyPatch, sigmas: tuple[float, float]
+) -> None:
+    board, (cameras, seen) = BOARDS["8x6"], seen_around("8x6", True, 3)
+    twice = [
+        replace(one, sightings=(*one.sightings, replace(one.sightings[-1], board=1)))
+        for one in seen[:2]
+    ]
+    found = iter(LooksByVote((0, 0), (sigma, sigma), sigma, ()) for sigma in sigmas)
+    monkeypatch.setattr(labelling, "choose_looks", lambda votes: next(found))
+
+    _, evidence = label_still_boards([board, board], cameras[:2], twice)
+
+    assert evidence.is_weak
+    assert evidence.weakest_sigma == 1.0
 
 
 def test_of_two_cameras_either_may_be_mirrored() -> None:

@@ -31,7 +31,7 @@ from hybridve.calib.pose import (
 )
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import undistort_mask
-from hybridve.hull.evaluate import moved_views, rig_views
+from hybridve.hull.chain import moved_views, rig_views
 from hybridve.hull.query.bounds import FREE, verdicts
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Views, make_hull

@@ -13,7 +13,9 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
+from hybridve.calib.plain import read_strictly, to_plain
 from hybridve.calib.pose import rotation_about_axes, transform
+from hybridve.calib.record import LensChoice
 from hybridve.calib.solving.lens_choice import CANDIDATES, choose_lens, choose_shared_lens
 from hybridve.calib.solving.lens_fit import fit_lens
 
@@ -61,9 +63,9 @@ def test_models_that_differ_beyond_the_noise_are_told_apart(model: str) -> None:
 
     assert chosen.camera.model == model
     assert chosen.choice is not None
-    assert chosen.choice["model"] == model
-    assert chosen.choice["candidates"][model]["bic"] <= 2.0
-    assert chosen.choice["reason"].startswith(f"{model}: ")
+    assert chosen.choice.model == model
+    assert chosen.choice.candidates[model].bic <= 2.0
+    assert chosen.choice.reason.startswith(f"{model}: ")
 
 
 def test_a_wide_fisheye_is_recognised() -> None:
@@ -88,15 +90,16 @@ def test_a_wide_fisheye_is_recognised() -> None:
     assert chosen.camera.model in {"OPENCV_FISHEYE", "RADIAL_FISHEYE", "EUCM"}
     assert chosen.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
     assert chosen.choice is not None
-    assert "PINHOLE" not in chosen.choice["candidates"]  # straight lines end long before
+    assert "PINHOLE" not in chosen.choice.candidates  # straight lines end long before
 
 
 def test_the_choice_can_be_stored_and_says_what_is_told_apart() -> None:
     chosen = choose_lens([BOARD], noisy(make_camera("cam", "OPENCV", np.eye(3, 4)), 25, 0.1))
 
     assert chosen.choice is not None
-    assert json.loads(json.dumps(chosen.choice, allow_nan=False)) == chosen.choice
-    assert "k1, k2, p1, p2 are told apart from zero" in chosen.choice["reason"]
+    told = json.loads(json.dumps(to_plain(chosen.choice), allow_nan=False))
+    assert read_strictly(LensChoice, told, "choice") == chosen.choice
+    assert "k1, k2, p1, p2 are told apart from zero" in chosen.choice.reason
 
 
 def test_what_hangs_together_in_a_view_counts_less() -> None:
@@ -114,9 +117,9 @@ def test_what_hangs_together_in_a_view_counts_less() -> None:
 
     assert bent_choice is not None
     assert flat_choice is not None
-    assert flat_choice["inflation"] < 1.6
-    assert bent_choice["inflation"] > 2.0
-    assert bent_choice["n_effective"] < 20 * 42
+    assert flat_choice.inflation < 1.6
+    assert bent_choice.inflation > 2.0
+    assert bent_choice.n_effective < 20 * 42
 
 
 def test_the_choice_does_not_depend_on_the_order_of_sightings() -> None:

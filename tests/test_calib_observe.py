@@ -19,9 +19,10 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import FrameSource, open_source
 from hybridve.calib.pose import compose
-from hybridve.calib.seeing import observe
+from hybridve.calib.seeing import search
 from hybridve.calib.seeing.corner_cache import CornerCache
-from hybridve.calib.seeing.observe import CameraInput, ObserveSettings, find_boards, observe_boards
+from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
+from hybridve.calib.seeing.observe import find_boards, observe_boards
 
 #: Images searched at once; the tests share the machine.
 SETTINGS = ObserveSettings(threads=2)
@@ -85,7 +86,7 @@ def forbid(patch: pytest.MonkeyPatch) -> None:
         raise AssertionError("a picture was decoded")
 
     patch.setattr(FrameSource, "frames", decode)
-    patch.setattr(observe, "read_image", decode)
+    patch.setattr(search, "read_image", decode)
     patch.setattr(cv2, "imread", decode)
 
 
@@ -524,7 +525,7 @@ def test_another_version_of_the_code_looks_again(
     before = list(CALLS)
     CALLS.clear()
 
-    monkeypatch.setattr(observe, "_digest_of_code", lambda module: f"new {module}")
+    monkeypatch.setattr(search, "_digest_of_code", lambda files: "new")
     observe_boards([BOARD], cameras, SETTINGS, None, CornerCache(kept))
 
     assert sorted(CALLS) == sorted(before)

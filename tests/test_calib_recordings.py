@@ -16,12 +16,14 @@ from hybridve.calib.boards.markers import Charuco
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import import_rig
+from hybridve.calib.formats.rigs import import_rig, rig_to_dict
 from hybridve.calib.image_io import open_source
 from hybridve.calib.judging.check import check_rig
 from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.record import CalibrationRecord, SecondOpinion
 from hybridve.calib.rig import Rig
-from hybridve.calib.seeing.observe import CameraInput, ObserveSettings, find_boards, observe_boards
+from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
+from hybridve.calib.seeing.observe import find_boards, observe_boards
 
 pytestmark = pytest.mark.recording
 
@@ -84,12 +86,21 @@ def test_horseman_cameras_stand_where_two_calibrations_have_them(horseman: Rig) 
 
 
 def test_horseman_corners_miss_by_less_than_half_a_pixel(horseman: Rig) -> None:
-    for told in horseman.provenance["cameras"].values():
-        assert told["intrinsics"]["rms_px"] < 0.5
-        assert told["intrinsics"]["views_used"] >= 10
-        assert told["extrinsics"]["rms_px"] < 0.2
-        assert told["extrinsics"]["how"].startswith("detected")
-    assert json.dumps(horseman.provenance, allow_nan=False)
+    for told in horseman.provenance.cameras.values():
+        assert told.intrinsics.rms_px < 0.5
+        assert told.intrinsics.views_used >= 10
+        assert told.extrinsics.rms_px < 0.2
+        assert told.extrinsics.how.startswith("detected")
+    assert json.dumps(rig_to_dict(horseman), allow_nan=False)
+
+
+def test_colmap_agrees_about_horseman(horseman: Rig) -> None:
+    record = horseman.provenance
+
+    assert isinstance(record, CalibrationRecord)
+    assert isinstance(record.second_opinion, SecondOpinion)
+    assert record.second_opinion.difference95_m < record.second_opinion.expected95_m
+    assert record.doubts == ()
 
 
 def test_horseman_cameras_are_above_the_floor_and_upright(horseman: Rig) -> None:
@@ -100,10 +111,10 @@ def test_horseman_cameras_are_above_the_floor_and_upright(horseman: Rig) -> None
 
 
 def test_the_scene_tells_which_way_round_horsemans_board_was_seen(horseman: Rig) -> None:
-    evidence = horseman.provenance["labelling"]
-    assert evidence["looks"] == 2
-    assert evidence["decided_by"] == "matches of the scene"
-    assert evidence["weakest_sigma"] > 5.0
+    evidence = horseman.provenance.labelling
+    assert evidence.looks == 2
+    assert evidence.decided_by == "matches of the scene"
+    assert evidence.weakest_sigma > 5.0
 
 
 def test_marks_set_the_world_that_their_reference_has(
@@ -130,9 +141,7 @@ def test_marks_set_the_world_that_their_reference_has(
     for camera in reference.cameras:
         off_m = np.linalg.norm(marked[camera.name].center_world - camera.center_world)
         assert off_m < 0.15  # of up to 4.3 m; turned the other way round it would be metres
-    assert all(
-        "detected" in told["extrinsics"]["how"] for told in marked.provenance["cameras"].values()
-    )
+    assert all("detected" in told.extrinsics.how for told in marked.provenance.cameras.values())
 
 
 @pytest.mark.parametrize(
@@ -286,8 +295,8 @@ def test_a_stereo_pair_of_moving_boards_has_its_published_baseline(recordings: P
 
     baseline = np.linalg.norm(rig["left"].center_world - rig["right"].center_world)
     assert baseline == pytest.approx(STEREO_BASELINE, rel=STEREO_RELATIVE)
-    assert rig.provenance["rms_px"] < 0.25
-    assert rig.provenance["cameras"]["left"]["extrinsics"]["views_used"] == 13
+    assert rig.provenance.rms_px < 0.25
+    assert rig.provenance.cameras["left"].extrinsics.views_used == 13
 
 
 def test_a_stereo_pair_in_two_files_is_taken(recordings: Path) -> None:
@@ -318,6 +327,8 @@ def test_a_charuco_rig_misses_by_less_than_its_publisher_accepts(recordings: Pat
     misses_px = np.linalg.norm(np.concatenate(list(calibration.residuals_px.values())), axis=1)
     assert misses_px.mean() <= 1.30  # the publisher accepts 1.8, a plain adjustment reached 1.26
     assert len(misses_px) > 5000  # not by leaving out what does not fit
+    assert isinstance(calibration.record.second_opinion, SecondOpinion)
+    assert not calibration.record.second_opinion.disagrees
     first, second, third = calibration.rig.cameras
     for camera in calibration.rig.cameras:
         np.testing.assert_allclose(camera.params[:2], 2855.0, rtol=0.015)

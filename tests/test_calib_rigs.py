@@ -17,6 +17,7 @@ from hybridve.calib.formats.colmap import read_colmap_model, write_colmap_model
 from hybridve.calib.formats.rigs import import_rig, read_rig, rig_to_dict, write_rig
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import angle_between, compose, transform
+from hybridve.calib.record import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 #: Text with 17 digits gives a projection back to this, in pixels.
@@ -29,7 +30,7 @@ SIZES = {"cam1": (640, 480), "cam2": (640, 480)}
 @pytest.fixture
 def rig() -> Rig:
     cameras = ring(BOARD, ["PINHOLE", "PINHOLE"])
-    return Rig(tuple(cameras), {"method": "made up", "rms_px": 0.1})
+    return Rig(tuple(cameras), MadeElsewhere({"method": "made up", "rms_px": 0.1}))
 
 
 def points() -> NDArray[np.float64]:
@@ -72,7 +73,7 @@ def test_a_rig_is_read_back_to_the_bit(tmp_path: Path) -> None:
         for index, model in enumerate(LENSES)
     ]
     skewed = Camera("skewed", "PINHOLE", 8, 6, np.array([9.0, 9, 4, 3]), np.eye(3, 4), 0.125)
-    rig = Rig((*cameras, skewed), {"rms_px": 1 / 3, "views": {"a.png": "blurred"}})
+    rig = Rig((*cameras, skewed), MadeElsewhere({"rms_px": 1 / 3, "views": {"a.png": "blurred"}}))
 
     write_rig(tmp_path / "rig.json", rig)
     again = read_rig(tmp_path / "rig.json")
@@ -277,7 +278,7 @@ def test_rows_of_matrices_are_taken_without_loss(tmp_path: Path, rig: Rig, separ
 
     for camera in rig.cameras:
         assert_same_image(camera, taken[camera.name])
-    assert taken.provenance["unit"] == "m"
+    assert taken.provenance.told["unit"] == "m"
 
 
 @pytest.mark.parametrize(

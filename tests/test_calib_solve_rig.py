@@ -24,6 +24,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import cam_from_img, img_from_cam
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.pose import angle_between, compose, invert
+from hybridve.calib.record import BoardRecord
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.lens_fit import LensSettings
 
@@ -58,7 +59,7 @@ def test_noise_free_corners_give_back_the_rig(model: str) -> None:
     rig = solve_rig([BOARD], observe_exactly(BOARD, cameras)).rig
 
     assert_same_rig(rig, cameras)
-    assert rig.provenance["rms_px"] < EXACT_PX
+    assert rig.provenance.rms_px < EXACT_PX
 
 
 def test_models_may_be_mixed_in_one_rig() -> None:
@@ -101,10 +102,10 @@ def test_the_error_that_is_told_is_the_noise_that_was_there() -> None:
     rig = solve_rig([BOARD], observe_exactly(BOARD, cameras, n_stills=30, noise_px=noise_px)).rig
 
     # Length of a two-dimensional error; parameters take up a few percent.
-    assert rig.provenance["rms_px"] == pytest.approx(noise_px * np.sqrt(2), rel=0.06)
-    for told in rig.provenance["cameras"].values():
-        assert told["intrinsics"]["rms_px"] == pytest.approx(noise_px * np.sqrt(2), rel=0.1)
-        assert told["intrinsics"]["views_used"] == 30
+    assert rig.provenance.rms_px == pytest.approx(noise_px * np.sqrt(2), rel=0.06)
+    for told in rig.provenance.cameras.values():
+        assert told.intrinsics.rms_px == pytest.approx(noise_px * np.sqrt(2), rel=0.1)
+        assert told.intrinsics.views_used == 30
 
 
 def test_the_world_has_z_up_and_cameras_above_the_floor() -> None:
@@ -139,10 +140,10 @@ def test_blurred_and_wrong_views_are_dropped_and_named() -> None:
 
     rig = solve_rig([BOARD], [with_stills(seen, corners)]).rig
 
-    told = rig.provenance["cameras"]["cam1"]["intrinsics"]
-    assert set(told["views_dropped"]) == {"blurred", "bent", "another board"}
-    assert all("px" in reason for reason in told["views_dropped"].values())
-    assert told["views_used"] == 14
+    told = rig.provenance.cameras["cam1"].intrinsics
+    assert set(told.views_dropped) == {"blurred", "bent", "another board"}
+    assert all("px" in reason for reason in told.views_dropped.values())
+    assert told.views_used == 14
     # As good as without them: 14 views with 0.1 px of noise give the centre to a few mm.
     assert np.linalg.norm(rig.cameras[0].center_world - cameras[0].center_world) < 0.005
 
@@ -155,12 +156,12 @@ def test_a_corner_that_misses_by_far_is_left_out_and_listed() -> None:
     spoilt["4.png"][17] += [2.5, 0.0]
     observations[0] = with_stills(observations[0], spoilt)
 
-    told = solve_rig([BOARD], observations).rig.provenance["adjustment"]
+    told = solve_rig([BOARD], observations).record.adjustment
 
-    assert told["outliers"] == 1
-    (outlier,) = told["worst_outliers"]
-    assert (outlier["camera"], outlier["image"], outlier["point"]) == ("cam1", "4.png", 17)
-    assert outlier["missed_px"] == pytest.approx(2.5, abs=1.0)
+    assert told.outliers == 1
+    (outlier,) = told.worst_outliers
+    assert (outlier.camera, outlier.image, outlier.point) == ("cam1", "4.png", 17)
+    assert outlier.missed_px == pytest.approx(2.5, abs=1.0)
 
 
 def test_too_few_views_are_named_with_what_was_expected() -> None:
@@ -323,5 +324,5 @@ def test_settings_reach_the_provenance() -> None:
 
     rig = solve_rig([BOARD], observations, settings).rig
 
-    assert rig.provenance["settings"]["lens"]["loss_px"] == 0.5
-    assert rig.provenance["boards"] == [{"name": "board", "body": None, "is": str(BOARD)}]
+    assert rig.provenance.settings["lens"]["loss_px"] == 0.5
+    assert rig.provenance.boards == (BoardRecord("board", None, str(BOARD)),)

@@ -7,12 +7,12 @@ import pytest
 from helpers.boards import look_at, make_camera, project, render_board
 from numpy.typing import NDArray
 
+from hybridve.calib.boards.corner_files import read_corners
 from hybridve.calib.boards.target import (
     Chessboard,
     detect_corners,
     find_corners,
     list_corners,
-    read_corners,
     refine_corners,
 )
 from hybridve.calib.camera import Camera

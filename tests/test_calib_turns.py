@@ -10,9 +10,10 @@ from helpers.turned_rigs import BOARDS, SIZE_PX, around, turned
 from hybridve.calib.boards.board import Observations, Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.judging.check import RigCheck, check_rig
+from hybridve.calib.judging.check import check_rig
 from hybridve.calib.pose import compose
 from hybridve.calib.solving.bundle import moved_pose
+from hybridve.calib.verdict import RigCheck
 
 SYMMETRIC, QUARTERS = BOARDS[0], BOARDS[3]
 

@@ -16,16 +16,16 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import project_points
+from hybridve.calib.placing.marks import Mark, triangulate
 from hybridve.calib.placing.world import (
-    Mark,
     Placed,
     SeenBoards,
     place_by_board,
     place_by_points,
     place_on_floor,
     place_world,
-    triangulate,
 )
+from hybridve.calib.plain import to_plain
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.bundle import BundleView
 
@@ -83,7 +83,8 @@ def lying(
 
 def assert_same(placed: Placed, world_from_rig: Pose) -> None:
     np.testing.assert_allclose(placed.world_from_rig, world_from_rig, atol=EXACT_M)
-    assert json.loads(json.dumps(placed.diagnostics)) == placed.diagnostics
+    told = to_plain(placed.told)
+    assert json.loads(json.dumps(told)) == told
 
 
 @settings(max_examples=15)
@@ -100,9 +101,9 @@ def test_all_ways_find_the_same_world(seed: int) -> None:
     marks = clicked(cameras, rig_from_world, TRUE_POINTS)
     by_points = place_world("points", cameras, seen, marks)
     assert_same(by_points, world_from_rig)
-    assert max(by_points.diagnostics["residuals_mm"].values()) < 1e-3
-    assert by_points.diagnostics["scale"] == pytest.approx(1.0, abs=1e-5)
-    assert not by_points.diagnostics["warnings"]
+    assert max(by_points.told.residuals_mm.values()) < 1e-3
+    assert by_points.told.scale == pytest.approx(1.0, abs=1e-5)
+    assert not by_points.told.warnings
 
     # The floor's origin is the foot of the board's middle, its x that of the board.
     about_middle = np.column_stack([np.eye(3), -BOARD.center_board])
@@ -122,9 +123,9 @@ def test_the_board_is_that_of_the_first_instant_that_most_cameras_see() -> None:
     placed = place_by_board(cameras, seen)
 
     assert_same(placed, invert(raised[2]))
-    assert placed.diagnostics["instant"] == 20
-    assert placed.diagnostics["text"] == "the board in frame 20"
-    assert placed.diagnostics["cameras"] == ["cam2", "cam3"]
+    assert placed.told.instant == 20
+    assert placed.told.text == "the board in frame 20"
+    assert placed.told.cameras == ("cam2", "cam3")
 
 
 def test_a_camera_that_sees_the_board_from_below_is_named() -> None:
@@ -146,7 +147,7 @@ def test_a_camera_behind_a_board_that_others_see_is_a_warning() -> None:
 
     placed = place_by_board(cameras, lying([np.eye(3, 4)], [0], [[0, 2]]))
 
-    (warning,) = placed.diagnostics["warnings"]
+    (warning,) = placed.told.warnings
     assert "'cam2' stands 1.15 m behind" in warning
 
 
@@ -164,11 +165,11 @@ def test_noise_of_clicks_is_told_in_mm() -> None:
     (x, y) = marks[4].pixels["cam1"]
     marks[4] = replace(marks[4], pixels={**marks[4].pixels, "cam1": (x + 15.0, y)})
 
-    told = place_by_points(cameras, marks).diagnostics
+    told = place_by_points(cameras, marks).told
 
-    assert max(told["residuals_mm"], key=lambda name: told["residuals_mm"][name]) == "p4"
-    assert 1.0 < told["residuals_mm"]["p4"] < 50.0
-    (warning,) = told["warnings"]
+    assert max(told.residuals_mm, key=lambda name: told.residuals_mm[name]) == "p4"
+    assert 1.0 < told.residuals_mm["p4"] < 50.0
+    (warning,) = told.warnings
     assert "point 'p4'" in warning
 
 
@@ -178,13 +179,13 @@ def test_a_scale_that_disagrees_is_named() -> None:
     placed = place_by_points(
         cameras, clicked(cameras, np.eye(3, 4), TRUE_POINTS, TRUE_POINTS / 1.05)
     )
-    (warning,) = placed.diagnostics["warnings"]
+    (warning,) = placed.told.warnings
     assert "1.050 times as far apart" in warning
 
     within = place_by_points(
         cameras, clicked(cameras, np.eye(3, 4), TRUE_POINTS, TRUE_POINTS / 1.01)
     )
-    assert not within.diagnostics["warnings"]
+    assert not within.told.warnings
 
     with pytest.raises(CalibrationError, match=r"10\.000 times as far apart.*millimetres"):
         place_by_points(cameras, clicked(cameras, np.eye(3, 4), TRUE_POINTS, TRUE_POINTS / 10.0))
@@ -255,7 +256,7 @@ def test_the_board_need_not_lie_on_the_floor() -> None:
     np.testing.assert_allclose(middle[:2], 0.0, atol=EXACT_M)
     along = (world_from_rig[:, :3] @ tilt)[:, 0]
     assert abs(along[1]) < EXACT_M < along[0]
-    assert max(map(abs, placed.diagnostics["residuals_mm"].values())) < 1e-3
+    assert max(map(abs, placed.told.residuals_mm.values())) < 1e-3
 
 
 def test_a_point_off_the_floor_shows() -> None:
@@ -263,9 +264,9 @@ def test_a_point_off_the_floor_shows() -> None:
     points = np.vstack([TRUE_POINTS[:4], [[0.3, 0.25, 0.02]]])
     marks = clicked(cameras, np.eye(3, 4), points, is_floor=True)
 
-    told = place_on_floor(cameras, lying([np.eye(3, 4)], [0], [[0, 1]]), marks).diagnostics
+    told = place_on_floor(cameras, lying([np.eye(3, 4)], [0], [[0, 1]]), marks).told
 
-    assert told["residuals_mm"]["p4"] == pytest.approx(16.0, abs=0.5)  # 20 mm, less the mean
+    assert told.residuals_mm["p4"] == pytest.approx(16.0, abs=0.5)  # 20 mm, less the mean
 
 
 def test_a_camera_under_the_floor_is_named() -> None:

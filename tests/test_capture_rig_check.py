@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 import pytest
 from helpers.boards import floor_of_noise, look_at, make_camera, render_board, turned_about
+from helpers.records import make_record
 
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.rigs import read_rig, write_rig
 from hybridve.calib.pose import compose, rotation_about_axes
+from hybridve.calib.record import BY_SCENE, Labelling, MadeElsewhere
 from hybridve.calib.rig import Rig
 from hybridve.cli.calibrate import NOT_GOOD_ENOUGH
 from hybridve.hull.capture import rig_check
@@ -96,7 +98,8 @@ def load(session: Path) -> Rig:
 
 
 def told(rig: Rig) -> tuple[str, str]:
-    return rig.provenance["check"]["verdict"], rig.provenance["check"]["message"]
+    assert rig.check is not None
+    return rig.check.verdict, rig.check.message
 
 
 def no_board(session: Path, name: str) -> None:
@@ -123,7 +126,7 @@ def test_a_rig_that_fits_is_used_silently_and_tested_once(
     verdict, message = told(first)
     assert verdict == "agrees"
     assert "the rig agrees with the board" in message
-    assert again.provenance == first.provenance
+    assert again.check == first.check
     assert not caplog.records
 
 
@@ -132,7 +135,9 @@ def test_a_rig_that_the_board_refutes_is_refused_with_what_a_check_says(
 ) -> None:
     rig = load(session)
     write_rows(session.parent, bumped())
-    said = check_session(load_session(session), Rig(tuple(bumped()), {}, rig.covariance)).message
+    said = check_session(
+        load_session(session), Rig(tuple(bumped()), covariance=rig.covariance)
+    ).message
 
     with pytest.raises(CalibrationError) as caught:
         load(session)
@@ -222,7 +227,9 @@ def test_one_clip_without_a_board_does_not_hide_what_the_others_show(
     rig = load(session)
 
     assert told(rig)[0] == "agrees"
-    assert rig.provenance["check"]["untested"] == ["cam3"]
+    assert rig.check is not None
+    assert rig.check.check is not None
+    assert rig.check.check.untested == ("cam3",)
     (record,) = caplog.records
     assert "not tested: cam3" in record.getMessage()
     write_rows(session.parent, bumped())
@@ -260,7 +267,7 @@ def test_a_rig_that_was_calibrated_from_the_clip_is_not_tested_again(
     """Not even a wrong one: what is asked is whether this very rig was made of this very clip."""
     text = re.sub(r"rig(_unit)? = .*\n", "", session.read_text(encoding="utf-8"))
     session.write_text(text, encoding="utf-8")
-    made = Rig(tuple(bumped()), {"labelling": {}})
+    made = Rig(tuple(bumped()), make_record(["cam1", "cam2", "cam3"]))
     (session.parent / "rig").mkdir()
     write_rig(session.parent / "rig" / "rig.json", made)
     loaded = load_session(session)
@@ -272,8 +279,19 @@ def test_a_rig_that_was_calibrated_from_the_clip_is_not_tested_again(
         forbid_searching(patch)
         assert told(load(session))[0] == "made here"
         assert not caplog.records
-        doubtful = replace(made, provenance={"labelling": {"is_weak": True}})
+        weak = Labelling(
+            looks=2,
+            decided_by=BY_SCENE,
+            matches_by_look={},
+            margin_sigma={},
+            weakest_sigma=1.0,
+            is_weak=True,
+        )
+        doubtful = replace(made, provenance=make_record(["cam1", "cam2", "cam3"], labelling=weak))
         assert ask_boards(loaded, doubtful).verdict == "open"
+        nothing_told = ask_boards(loaded, replace(made, provenance=MadeElsewhere()))
+        assert nothing_told.verdict == "open"
+        assert "told no more" in nothing_told.message
     other = replace(made, cameras=tuple(cameras()))
     assert ask_boards(loaded, other).verdict == "agrees"
     assert read_rig(session.parent / "rig" / "rig.json").cameras[1].name == "cam2"

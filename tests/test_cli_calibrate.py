@@ -13,14 +13,18 @@ import pytest
 from click.testing import CliRunner
 from helpers.boards import board_poses, look_at, make_camera, render_board
 from helpers.recorded_boards import held_up
+from helpers.records import make_opinion
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Detection, Effort
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.judging.account import Calibration
 from hybridve.calib.pose import compose
+from hybridve.calib.record import BY_SCENE, Labelling
 from hybridve.cli.calibrate import NOT_GOOD_ENOUGH, calibrate
+from hybridve.hull.capture import rig as rig_of_session
 
 Run = Callable[..., int]
 Captured = pytest.CaptureFixture[str]
@@ -230,6 +234,10 @@ def test_the_text_begins_with_the_verdict(
 
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == calibrated[1]["certificate"]["verdict"]
+    told = calibrated[1]["certificate"]["second_opinion"]
+    assert told["difference95_m"] < told["expected95_m"]
+    (opinion,) = [line for line in lines if "second opinion" in line]
+    assert f"{told['sigmas']:.1f} standard deviations" in opinion
     assert lines[1] == f"{tmp_path / 'rig' / 'rig.json'}: 3 cameras"
 
 
@@ -246,8 +254,75 @@ def test_a_rig_that_is_not_good_enough_has_a_status_of_its_own(
     assert (tmp_path / "rig" / "rig.json").is_file()
 
 
+def contradicted(made: Calibration) -> Calibration:
+    assert made.record.adjustment is not None
+    adjustment = replace(made.record.adjustment, warnings=("cameras do not agree.",))
+    return replace(made, record=replace(made.record, adjustment=adjustment))
+
+
+def labelled_by_chance(made: Calibration) -> Calibration:
+    weak = Labelling(
+        looks=2,
+        decided_by=BY_SCENE,
+        matches_by_look={},
+        margin_sigma={},
+        weakest_sigma=1.0,
+        is_weak=True,
+    )
+    return replace(made, record=replace(made.record, labelling=weak))
+
+
+def contradicted_by_colmap(made: Calibration) -> Calibration:
+    return replace(made, record=replace(made.record, second_opinion=make_opinion(9.0)))
+
+
+def with_a_twin(made: Calibration) -> Calibration:
+    first, second, third = made.rig.cameras
+    twin = replace(first, name=second.name)
+    return replace(made, rig=replace(made.rig, cameras=(first, twin, third)))
+
+
+@pytest.mark.parametrize(
+    ("doubtful", "told"),
+    [
+        (contradicted, "cameras do not agree."),
+        (labelled_by_chance, "which way round each camera saw it"),
+        (with_a_twin, "stand in one place"),
+        (contradicted_by_colmap, "COLMAP's own adjustment of the same points"),
+    ],
+)
+def test_a_rig_that_is_doubted_passes_no_gate(
+    run: Run,
+    capsys: Captured,
+    calibrated: tuple[Path, dict[str, Any], str],
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    doubtful: Callable[[Calibration], Calibration],
+    told: str,
+) -> None:
+    """However small the error that is stated: without the doubt this rig passes 100 mm."""
+    calibrate_well = rig_of_session.calibrate_session
+    monkeypatch.setattr(
+        rig_of_session, "calibrate_session", lambda *given: doubtful(calibrate_well(*given))
+    )
+    arguments = ["calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page"]
+
+    assert run(*arguments, "--max-error-mm", "100") == NOT_GOOD_ENOUGH
+
+    shown = capsys.readouterr()
+    assert shown.out.startswith("not to be trusted: ")
+    assert told in shown.out.splitlines()[0]
+    assert "an unknown error, not to 100 mm" in shown.err
+    assert calibrated[1]["certificate"]["doubts"] == []
+
+
 def test_the_volume_is_the_one_that_is_asked_for(
-    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+    run: Run,
+    capsys: Captured,
+    calibrated: tuple[Path, dict[str, Any], str],
+    recorded: Path,
+    tmp_path: Path,
 ) -> None:
     box = "0,0,0:600,500,200"
     arguments = ["calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page", "--json"]
@@ -255,6 +330,8 @@ def test_the_volume_is_the_one_that_is_asked_for(
     assert run(*arguments, "--volume-mm", box) == 0
 
     certificate = json.loads(capsys.readouterr().out)["certificate"]
+    usual = calibrated[1]["certificate"]["second_opinion"]
+    assert certificate["second_opinion"]["expected95_m"] < usual["expected95_m"]
     low, high = certificate["volume_low_m"], certificate["volume_high_m"]
     assert (np.array(low) >= -1e-9).all()
     assert (np.array(high) <= [0.6 + 1e-9, 0.5 + 1e-9, 0.2 + 1e-9]).all()

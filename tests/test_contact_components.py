@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.chain import rig_views
 from hybridve.hull.contact.components import (
     NOWHERE,
     Coverage,
@@ -24,7 +25,6 @@ from hybridve.hull.contact.components import (
     is_real_at,
     pixel_rays,
 )
-from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.query.walk import spans_in_hull

@@ -8,12 +8,14 @@ from helpers.boards import look_at, make_camera
 from helpers.cones import BOX_FACES, ball_extent, box_vertices, hull_of_balls, plate, views_from
 from helpers.contacts import FREE
 from helpers.hulls import ball_hull, ball_masks, ring_views
+from helpers.records import make_camera_record, make_check, make_record
 from numpy.typing import NDArray
 from scipy.stats import binom, norm
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import moved_pose
+from hybridve.calib.verdict import RigTest
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.detect import Contact
 from hybridve.hull.contact.uncertainty import (
@@ -229,7 +231,7 @@ def test_a_rig_that_knows_its_covariance_tells_how_clearances_scatter() -> None:
     meter = ClearanceMeter(*plate(center + 0.4 * normal, normal), is_closed=False, tolerance_m=2e-4)
     names = tuple(camera.name for camera in cameras)
     found_m, stated_m = [], []
-    errors = outline_errors(names, {}, [0.0] * n_cameras, DoubtSettings(segmentation_px=0.0), rig)
+    errors = outline_errors(names, rig, [0.0] * n_cameras, DoubtSettings(segmentation_px=0.0))
     believed = _views_of(cameras)
     for _ in range(60):
         change = shared[:, 0] * rng.normal() + own * rng.normal(size=size)
@@ -455,13 +457,11 @@ def test_no_hull_no_doubt() -> None:
 
 
 def test_errors_come_from_the_rig_where_it_tells_them() -> None:
-    of_calibration = {
-        "cameras": {
-            "a": {"intrinsics": {"rms_px": 0.4}, "extrinsics": {"rms_px": 0.1}},
-            "b": {"intrinsics": {"rms_px": None}, "extrinsics": {"rms_px": 0.2}},
-        }
-    }
-    of_check = {"method": "imported", "check": {"rms_px": {"a": 2.0}}}
+    pose = look_at((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    cameras = tuple(make_camera(name, "PINHOLE", pose) for name in ("a", "b"))
+    cameras_told = {"a": make_camera_record(0.4, 0.1), "b": make_camera_record(None, 0.2)}
+    of_calibration = Rig(cameras, make_record((), cameras=cameras_told))
+    of_check = Rig(cameras, check=RigTest("agrees", "", make_check(rms_px={"a": 2.0})))
     settings = DoubtSettings(segmentation_px=0.6, calibration_px=0.9)
 
     calibrated = outline_errors(("a", "b"), of_calibration, (0.0, 0.6), settings)

@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.chain import Chain, EvaluateSettings, make_chain
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.uncertainty import DoubtSettings
-from hybridve.hull.evaluate import Chain, EvaluateSettings, evaluate, make_chain
+from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
 from hybridve.hull.report.schema import PATCH_COLUMNS, TABLES, FrameResult

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -134,33 +135,56 @@ def test_in_a_folder_that_the_user_names_nothing_is_removed(
     assert (base / ("a" * 16)).exists()
 
 
-@pytest.mark.slow
-def test_after_preparing_detect_compiles_nothing(tmp_path: Path) -> None:
-    environment = os.environ | {"HYBRIDVE_CACHE": str(tmp_path / "cache")}
-    environment.pop("NUMBA_CACHE_DIR", None)
+@pytest.fixture
+def prepared(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    """The folder of what was prepared, and an environment in which it is found.
+
+    It is what set-up prepared for these sources, or, half a minute later, what is prepared here.
+    """
+    environment = dict(os.environ)
+    if not prepare.is_prepared():
+        environment["HYBRIDVE_CACHE"] = str(tmp_path / "cache")
+        environment.pop("NUMBA_CACHE_DIR", None)
+    code = "from hybridve.hull.prepare import *; print(prepare_kernels(), FOLDER)"
+    shown = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    done, folder = shown.stdout.split()
+    assert done == "True", shown.stderr
+    return Path(folder), environment
+
+
+def test_after_preparing_detect_compiles_nothing(
+    prepared: tuple[Path, dict[str, str]], tmp_path: Path
+) -> None:
+    folder, environment = prepared
+    listed = (folder / "complete").read_text(encoding="utf-8").split()
+    alone = tmp_path / "alone" / folder.name  # what other tests compile is not there
+    for name in listed:
+        source = folder / name
+        (alone / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(source, alone / name)
+    for index in folder.rglob("*.nbi"):
+        shutil.copy2(index, alone / index.relative_to(folder))
+    before = kept_code(alone)
     centers = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.9, 0, 0]])
     session = write_ball_session(tmp_path, centers)
     scene = write_cube_scene(tmp_path, {"near": (0.0, 0.0, 150.0), "touched": (0.0, 0.0, 305.0)})
     arguments = [session, "--scene", scene, "-o", tmp_path / "report.h5", "--engine", "native"]
-    prepared = "from hybridve.hull.prepare import *; print(prepare_kernels(), is_prepared())"
 
-    shown = subprocess.run(
-        [sys.executable, "-c", prepared], env=environment, capture_output=True, text=True
-    )
-    before = kept_code(tmp_path / "cache" / "compiled")
     detected = subprocess.run(
         [sys.executable, "-m", "hybridve.cli", "detect", *arguments],
-        env=environment,
+        env=environment | {"NUMBA_CACHE_DIR": str(alone.parent)},
         capture_output=True,
         text=True,
     )
 
-    assert shown.stdout.split() == ["True", "True"], shown.stderr
     assert detected.returncode == 0, detected.stderr
-    assert kept_code(tmp_path / "cache" / "compiled") == before
+    assert kept_code(alone) == before
     # Two processes that compile one function for different types would take each other's code.
-    assert [name for name in before if not name.endswith(".1.nbc")] == []
-    assert {name.split(".")[0] for name in before} >= {"native", "certify", "segment", "background"}
+    assert [name for name in listed if not name.endswith(".1.nbc")] == []
+    names = {Path(name).name.split(".")[0] for name in listed}
+    assert names >= {"native", "certify", "segment", "background"}
 
 
 def test_nothing_is_compiled_that_is_done_or_would_not_be_kept(

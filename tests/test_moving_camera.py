@@ -25,24 +25,19 @@ from hybridve.calib.lens import img_from_cam
 from hybridve.calib.placing.hand_eye import mount_camera
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.rig import POSE_PARAMETERS, Mount, Rig, RigCovariance
+from hybridve.hull.about import resolved_settings
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import stored_silhouettes
 from hybridve.hull.capture.rig import rig_digest
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.chain import Chain, EvaluateSettings, make_chain, views_at
 from hybridve.hull.contact.backtrack import first_contact, interpolated_hull
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import detect_contacts
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.spacing import Move
 from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
-from hybridve.hull.evaluate import (
-    Chain,
-    EvaluateSettings,
-    evaluate,
-    make_chain,
-    resolved_settings,
-    views_at,
-)
+from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
@@ -279,7 +274,7 @@ def test_a_mount_calibrated_from_noisy_boards_gives_the_same_answers(
 
     found = list(evaluate(chain_of(path, scene), engine))
 
-    assert 0.0 < about["offset_std_mm"] < 3.0
+    assert 0.0 < about.offset_std_mm < 3.0
     for result, expected in zip(found, results, strict=True):
         for one, true in zip(result.findings, expected.findings, strict=True):
             assert one.contact.certificate == true.contact.certificate
@@ -361,7 +356,7 @@ def test_doubt_comes_from_the_covariance_where_the_camera_was(
     # The head errs most, so that it matters where it was.
     deviations = np.sqrt(np.array([*(of_camera * 3), *(100.0 * np.array(of_camera))]))
     covariance = RigCovariance(tuple(labels), np.diag(deviations**2))
-    rig = Rig(true_rig(0).cameras, {}, covariance, {"head": MOUNT})
+    rig = Rig(true_rig(0).cameras, covariance=covariance, mounts={"head": MOUNT})
     write_rig(tmp_path / "rig" / "rig.json", rig)
     chain = chain_of(path, scene)
     names, settings = chain.views.names, DoubtSettings()
@@ -369,8 +364,8 @@ def test_doubt_comes_from_the_covariance_where_the_camera_was(
     (part,) = chain.scene.objects
     for result in evaluate(chain, engine):
         for finding in result.findings:
-            still = Rig(true_rig(result.index).cameras, {}, covariance)
-            errors = outline_errors(names, {}, [0.0] * len(names), settings, still)
+            still = Rig(true_rig(result.index).cameras, covariance=covariance)
+            errors = outline_errors(names, still, [0.0] * len(names), settings)
             masks = ball_masks(views_of(true_rig(result.index)), CENTERS[result.index], RADIUS_M)
             hull = make_hull(views_at(chain, result.index), masks)
             meter = ClearanceMeter(part.vertices_world, part.faces, is_closed=True)

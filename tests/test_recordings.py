@@ -11,11 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.record import CalibrationRecord
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
-from hybridve.hull.evaluate import rig_views
+from hybridve.hull.chain import rig_views
 from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull
@@ -102,8 +103,10 @@ def test_horseman_is_calibrated_as_others_did_and_stands_above_the_floor(horsema
     # The references differ by up to 4 % from each other.
     assert np.abs(error).max() < 0.02
     assert (centers[:, 2] > 1.0).all(), "tripods are taller than that"
-    for camera in rig.provenance["cameras"].values():
-        assert camera["intrinsics"]["rms_px"] <= 0.5
+    assert isinstance(rig.provenance, CalibrationRecord)
+    for camera in rig.provenance.cameras.values():
+        assert camera.intrinsics.rms_px is not None
+        assert camera.intrinsics.rms_px <= 0.5
 
 
 @pytest.mark.parametrize(
@@ -167,7 +170,7 @@ def test_the_person_sits_on_the_floor_and_is_as_tall_as_a_person(horseman: Path)
 
 def test_horseman_engines_find_the_same(run: Run, horseman: Path, tmp_path: Path) -> None:
     scene = DATA / "horseman" / "scene.toml"
-    frames = {"native": ":", "compute": ":", "stencil": "0::10", "reference": "0::50"}
+    frames = {"native": ":", "compute": "0::5", "stencil": "0::10", "reference": "0::50"}
     counts, certificates = {}, {}
     for engine, chosen in frames.items():
         path = tmp_path / f"{engine}.h5"
@@ -182,13 +185,13 @@ def test_horseman_engines_find_the_same(run: Run, horseman: Path, tmp_path: Path
     assert len(native["forearm"]) == 426
     for name in native:
         # Samples within 1e-3 px of a pixel edge may differ: some of ten thousand.
-        for other, found in ((compute, native[name]), (stencil, native[name][::10])):
+        for other, found in ((compute, native[name][::5]), (stencil, native[name][::10])):
             difference = np.abs(found.astype(int) - other[name].astype(int))
             assert (difference <= 1e-3 * found + 1).all(), name
             assert difference.sum() <= 1e-4 * found.sum() + 1, name
         np.testing.assert_array_equal(native[name][::50], reference[name])
         # What is certain does not depend on the engine.
-        for engine, step in (("compute", 1), ("stencil", 10), ("reference", 50)):
+        for engine, step in (("compute", 5), ("stencil", 10), ("reference", 50)):
             expected = certificates["native"][name][::step]
             np.testing.assert_array_equal(certificates[engine][name], expected)
     touched = {name for name, found in native.items() if found.any()}

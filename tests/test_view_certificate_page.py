@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from helpers.boards import LENSES, look_at, make_camera, ring
+from helpers.records import make_opinion, make_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
@@ -31,8 +32,9 @@ from hybridve.calib.judging.certificate import (
     working_volume,
 )
 from hybridve.calib.lens import cam_from_img, parameter_names, project_points
+from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion
 from hybridve.calib.rig import POSE_PARAMETERS, Rig, RigCovariance
-from hybridve.calib.solving.covariance import Noise, point_errors
+from hybridve.calib.solving.covariance import point_errors
 from hybridve.hull.view.certificate_charts import (
     CELLS,
     binned_means,
@@ -72,6 +74,10 @@ def seen_by(camera: Camera, count: int, seed: int = 0) -> SeenPoints:
     )
 
 
+def record_of(rig: Rig) -> CalibrationRecord:
+    return make_record([camera.name for camera in rig.cameras], noise=NOISE)
+
+
 def case_of(
     names: list[str], count: int = 60
 ) -> tuple[Rig, Certificate, dict[str, SeenPoints], Volume]:
@@ -79,7 +85,7 @@ def case_of(
     rig = rig_of([replace(one, name=name) for one, name in zip(cameras, names, strict=True)])
     seen = {camera.name: seen_by(camera, count, k) for k, camera in enumerate(rig.cameras)}
     volume = working_volume(rig)
-    return rig, certify(rig, seen, NOISE, volume), seen, volume
+    return rig, certify(rig, record_of(rig), seen, volume), seen, volume
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +188,18 @@ def test_the_page_says_what_the_certificate_says(
     assert len(page.images()) == len(certificate.cameras) + 2
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_second_opinion_is_told_or_why_there_is_none(tmp_path: Path, is_there: bool) -> None:
+    rig, certificate, seen, volume = case_of(["left", "right"])
+    opinion = make_opinion(1.7) if is_there else NoOpinion("COLMAP has no <lens>")
+
+    page = page_of(tmp_path, (rig, replace(certificate, second_opinion=opinion), seen, volume))
+
+    told = ["1.7 mm", "1.7 standard deviations", "3.0 mm"] if is_there else ["COLMAP has no <lens>"]
+    for words in ("second opinion", *told):
+        assert words in page.text, words
+
+
 def test_nothing_is_fetched_and_nothing_runs(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -244,7 +262,7 @@ def test_one_camera_has_a_page_without_millimetres(tmp_path: Path) -> None:
 
 def test_a_camera_that_saw_nothing_and_points_without_numbers_are_told(tmp_path: Path) -> None:
     rig, _, seen, volume = case_of(["blind", "half"])
-    certificate = certify(rig, {"half": seen["half"]}, NOISE, volume)
+    certificate = certify(rig, record_of(rig), {"half": seen["half"]}, volume)
     gaps = SeenPoints(
         np.concatenate([seen["half"].pixels, [[np.nan, 1.0], [3.0, 4.0]]]),
         np.concatenate([seen["half"].residuals_px, [[0.0, 0.0], [np.nan, np.inf]]]),
@@ -263,7 +281,7 @@ def test_a_volume_that_nobody_sees_has_a_page(
 ) -> None:
     rig, _, seen, _ = two
     volume = Volume(np.zeros((0, 3)), np.zeros(3), np.ones(3), 2)
-    certificate = certify(rig, seen, NOISE, volume)
+    certificate = certify(rig, record_of(rig), seen, volume)
 
     page = page_of(tmp_path, (rig, certificate, seen, volume))
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board
-from hybridve.calib.boards.target import Chessboard, list_corners, read_corners
+from hybridve.calib.boards.corner_files import read_corners
+from hybridve.calib.boards.target import Chessboard, list_corners
 from hybridve.calib.errors import CalibrationError
 
 _COLUMNS = ("image", "frame", "board", "corner", "x", "y")

@@ -16,9 +16,7 @@ Datta, Kim and Kanade, *Accurate camera calibration using iterative refinement o
 ICCV workshops 2009 (refinement in the frontal view of the board).
 """
 
-import csv
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -27,6 +25,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Detection as Detection
 from hybridve.calib.boards.board import Effort
+from hybridve.calib.boards.symmetry import SYMMETRY_BLUR_PX, move_to_symmetry
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose
 
@@ -63,14 +62,6 @@ _WAYS = {
 #: A square is refined at this many pixels a side, so that one pixel of the image is never spread
 #: over less than a pixel of the frontal view (and small squares are not refined on a few pixels).
 _CELL_PX = (20.0, 100.0)
-
-#: Symmetry is looked at this far around a corner, in squares, at this many places a side, after a
-#: blur that makes slopes smooth. (On real stills a smaller reach, or weights against glare, left
-#: larger errors.)
-SYMMETRY_REACH = 0.6
-_SYMMETRY_STEPS = 13
-_SYMMETRY_ITERATIONS = 15
-SYMMETRY_BLUR_PX = 0.8
 
 #: A corner further than this off the smooth grid through all corners, in squares, is no corner.
 _ROUGH_TOLERANCE = 0.25
@@ -438,78 +429,6 @@ def _refine(
     return corners if _roughness(board, corners) < _ROUGH_TOLERANCE else None
 
 
-def symmetry_offsets(cell: float) -> NDArray[np.float64]:
-    """Return where symmetry is looked at around a corner: (K, 2), one of each opposite pair."""
-    steps = np.linspace(-SYMMETRY_REACH * cell, SYMMETRY_REACH * cell, _SYMMETRY_STEPS)
-    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    return np.asarray(offsets[: len(offsets) // 2])
-
-
-def move_to_symmetry(
-    view: NDArray[np.float32],
-    start: NDArray[np.float64],
-    cell: float,
-    blur_px: float,
-    weights: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Move points (N, 2) to where the view looks the same when turned by 180 degrees.
-
-    A corner between two black and two white squares has this symmetry however much blur or
-    overexposure spreads its edges. Least squares, by Gauss-Newton, over the differences of
-    opposite pixels, with linear shading fitted beside it. On rendered boards with squares of 10
-    by 3 px the error is 0.01 px, that of orthogonal gradients 0.06 px.
-
-    Parameters
-    ----------
-    view : (H, W) float32
-        Grey levels, seen frontally: a square is ``cell`` by ``cell`` pixels.
-    start : (N, 2) float64
-        Pixels, pixel centre at 0, nearer to a corner than to the middle of a square.
-    cell : float
-        The side of a square in pixels.
-    blur_px : float
-        Standard deviation of the blur that makes slopes smooth.
-    weights : (N, K) float64, optional
-        How much each of `symmetry_offsets` counts, where not all of the pattern is symmetric.
-    """
-    reach = SYMMETRY_REACH * cell
-    offsets = symmetry_offsets(cell)
-    window = np.exp(-0.5 * (offsets / (0.6 * reach)) ** 2).prod(axis=1)
-    window = np.tile(window, (len(start), 1)) if weights is None else window * weights
-    smooth = cv2.GaussianBlur(view, (0, 0), blur_px)
-    slope_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    slope_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-
-    def sample(image: NDArray[Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
-        x, y = (np.ascontiguousarray(points[..., axis], dtype=np.float32) for axis in (0, 1))
-        sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(sampled, np.float64)
-
-    points = start.copy()
-    shading = np.zeros((len(points), 2))
-    moving = np.arange(len(points))
-    for _ in range(_SYMMETRY_ITERATIONS):
-        ahead = points[moving, None] + offsets  # (M, K, 2)
-        behind = points[moving, None] - offsets
-        jacobian = np.stack(
-            [sample(slope, ahead) - sample(slope, behind) for slope in (slope_x, slope_y)]
-            + [np.broadcast_to(offset, ahead.shape[:2]) for offset in offsets.T],
-            axis=-1,
-        )  # (M, K, 4)
-        misses = sample(smooth, ahead) - sample(smooth, behind) + shading[moving] @ offsets.T
-        weighted = (jacobian * window[moving, :, None]).transpose(0, 2, 1)
-        normal = weighted @ jacobian + 1e-3 * np.eye(4)
-        step = -np.linalg.solve(normal, weighted @ misses[..., None])[..., 0]
-        shading[moving] += step[:, 2:]
-        length = np.linalg.norm(step[:, :2], axis=1)
-        shorter = np.minimum(1.0, 0.15 * cell / np.maximum(length, 1e-9))
-        points[moving] += step[:, :2] * shorter[:, None]
-        moving = moving[length >= 1e-4 * cell]
-        if len(moving) == 0:
-            break
-    return points
-
-
 def _list_by_colour(
     grey: NDArray[np.float32], board: Chessboard, corners: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
@@ -539,73 +458,3 @@ def _list_by_colour(
         candidates.append((starts_black and colours_decide, rightwards[0], -turn, turned))
     best = max(candidates, key=lambda candidate: candidate[:3])[3]
     return np.ascontiguousarray(best.reshape(-1, 2))
-
-
-def read_corners(path: Path) -> NDArray[np.float64]:
-    """Return corners that were marked by hand, (N, 2) pixels, pixel centre at 0.5, as listed.
-
-    Taken are OpenCV's XML, YAML or JSON (a matrix ``corners`` of N points, or ``CornersAmount``
-    with nodes ``Corner_0``, ``Corner_1``, ...) and CSV with a column x and a column y. All of them
-    are understood as OpenCV counts: the centre of the top-left pixel is at (0, 0).
-
-    Raises
-    ------
-    CalibrationError
-        If the file is missing or holds no corners.
-    """
-    if not path.is_file():
-        raise CalibrationError(f"{path}: there is no such corners file")
-    read = _read_corners_csv if path.suffix.lower() in {".csv", ".txt"} else _read_corners_opencv
-    corners = read(path)
-    if corners is None or len(corners) == 0 or not np.isfinite(corners).all():
-        raise CalibrationError(
-            f"{path}: no corners found; expected an OpenCV matrix 'corners', nodes 'Corner_0', "
-            "'Corner_1', ..., or CSV lines 'x,y'"
-        )
-    return corners + 0.5
-
-
-def _read_corners_opencv(path: Path) -> NDArray[np.float64] | None:
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError):
-        return None
-    try:
-        if not storage.isOpened():
-            return None
-        node = storage.getNode("corners")
-        if not node.empty():
-            matrix = np.asarray(node.mat(), np.float64)
-            return matrix.reshape(-1, 2) if matrix.ndim > 1 and matrix.size % 2 == 0 else None
-        amount = storage.getNode("CornersAmount")
-        if amount.empty():
-            return None
-        corners = []
-        for index in range(int(amount.real())):
-            node = storage.getNode(f"Corner_{index}")
-            if node.empty() or node.size() != 2:
-                return None
-            corners.append([node.at(0).real(), node.at(1).real()])
-        return np.array(corners, dtype=np.float64).reshape(-1, 2)
-    finally:
-        storage.release()
-
-
-def _read_corners_csv(path: Path) -> NDArray[np.float64] | None:
-    with path.open(newline="", encoding="utf-8") as file:
-        lines = [line for line in csv.reader(file) if line and not line[0].startswith("#")]
-    columns = (0, 1)
-    try:
-        float(lines[0][0])
-    except (ValueError, IndexError):
-        header = [cell.strip().lower() for cell in lines[0]] if lines else []
-        if "x" not in header or "y" not in header:
-            return None
-        columns = (header.index("x"), header.index("y"))
-        lines = lines[1:]
-    try:
-        return np.array([[float(line[column]) for column in columns] for line in lines]).reshape(
-            -1, 2
-        )
-    except (ValueError, IndexError):
-        return None

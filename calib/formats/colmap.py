@@ -8,6 +8,7 @@ import pycolmap
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.record import MadeElsewhere
 from hybridve.calib.rig import Rig
 
 
@@ -94,7 +95,7 @@ def read_colmap_model(folder: Path) -> Rig:
         )
     if not cameras:
         raise CalibrationError(f"{folder}: the COLMAP model holds no image with a pose")
-    return Rig(tuple(cameras), {"method": "COLMAP model", "folder": str(folder)})
+    return Rig(tuple(cameras), MadeElsewhere({"method": "COLMAP model", "folder": str(folder)}))
 
 
 def _pose(transform: pycolmap.Rigid3d) -> Pose:

@@ -25,7 +25,14 @@ from hybridve.calib.formats.foreign import (
     read_text,
 )
 from hybridve.calib.pose import nearest_to_axes
+from hybridve.calib.record import (
+    CalibrationRecord,
+    MadeElsewhere,
+    provenance_from_plain,
+    provenance_to_plain,
+)
 from hybridve.calib.rig import Mount, Rig, RigCovariance
+from hybridve.calib.verdict import RigTest
 
 FORMAT = "hybridve-rig"
 VERSION = 1
@@ -139,8 +146,12 @@ def rig_to_dict(rig: Rig) -> dict[str, Any]:
         ],
         **_covariance_to_dict(rig.covariance),
         **_mounts_to_dict(rig.mounts),
-        "provenance": rig.provenance,
+        "provenance": provenance_to_plain(rig.provenance) | _check_to_dict(rig.check),
     }
+
+
+def _check_to_dict(check: RigTest | None) -> dict[str, Any]:
+    return {} if check is None else {"check": check.to_dict()}
 
 
 def _covariance_to_dict(covariance: RigCovariance | None) -> dict[str, Any]:
@@ -210,9 +221,11 @@ def read_rig(path: Path) -> Rig:
         )
         for camera in cameras:
             _check_focal_lengths(camera)
+        told = dict(content.get("provenance", {}))
+        check = RigTest.from_dict(told.pop("check")) if "check" in told else None
         return Rig(
             cameras,
-            dict(content.get("provenance", {})),
+            provenance_from_plain(told),
             _covariance_from_dict(content["covariance"]) if "covariance" in content else None,
             {
                 str(name): Mount(
@@ -221,6 +234,7 @@ def read_rig(path: Path) -> Rig:
                 )
                 for name, entry in content.get("mounts", {}).items()
             },
+            check,
         )
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
@@ -293,7 +307,8 @@ def import_rig(
         return _choose(found, image_sizes, pattern)
     rig = _to_rig(found, pattern, unit, factor_m, pixel_centre, image_sizes)
     if unit == "squares":
-        rig = replace(rig, provenance={**rig.provenance, "square_m": square_m})
+        assert isinstance(rig.provenance, MadeElsewhere)
+        rig = replace(rig, provenance=MadeElsewhere({**rig.provenance.told, "square_m": square_m}))
     return rig
 
 
@@ -549,7 +564,7 @@ def _to_rig(
         "unit": unit,
         "pixel_centre": pixel_centre,
     }
-    return Rig(tuple(cameras), provenance)
+    return Rig(tuple(cameras), MadeElsewhere(provenance))
 
 
 def _refuse_mirrored(found: ForeignRig, chosen: Mapping[str, ForeignCamera], pattern: str) -> None:
@@ -616,9 +631,12 @@ def _choose(rig: Rig, image_sizes: Mapping[str, tuple[int, int]], pattern: str) 
         parts = [label.rpartition(" ") for label in covariance.labels]
         labels = tuple(f"{names[owner]} {parameter}" for owner, _, parameter in parts)
         covariance = RigCovariance(labels, covariance.matrix)
+    provenance = rig.provenance
+    if isinstance(provenance, CalibrationRecord):
+        provenance = provenance.renamed(names)
     return Rig(
         tuple(replace(camera, name=names[camera.name]) for camera in rig.cameras),
-        rig.provenance,
+        provenance,
         covariance,
         {names[name]: mount for name, mount in rig.mounts.items()},
     )

@@ -2,23 +2,33 @@
 
 import importlib.metadata
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Observations, is_seen
+from hybridve.calib.judging.certificate import working_volume
 from hybridve.calib.placing.fixed_cameras import Solved, other_tilt
 from hybridve.calib.placing.moving_cameras import Mounted
 from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.record import (
+    METHOD,
+    Adjustment,
+    BoardRecord,
+    CalibrationRecord,
+    CameraRecord,
+    ClipRecord,
+    ClocksRecord,
+    MountRecord,
+    Noise,
+    StillsRecord,
+)
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import POSE, BundleView
-from hybridve.calib.solving.covariance import (
-    Noise,
-    camera_parameter_names,
-)
+from hybridve.calib.solving.covariance import camera_parameter_names
 from hybridve.calib.solving.lens_fit import FittedLens, rms
+from hybridve.calib.solving.second_opinion import second_opinion
 
 #: Outliers that are listed one by one.
 _TOLD_OUTLIERS = 50
@@ -31,15 +41,15 @@ class Calibration:
     Attributes
     ----------
     rig : Rig
-        With its covariance; ``provenance`` holds errors per camera, what was dropped and why.
-    noise : Noise
-        How noisy the points of boards were.
+        With its covariance; its provenance is `record`.
+    record : CalibrationRecord
+        Errors per camera, what was decided, dropped and doubted, and why.
     pixels, residuals_px : dict of str to (K, 2) float64
         By camera all points that were used, and observed minus projected.
     """
 
     rig: Rig
-    noise: Noise
+    record: CalibrationRecord
     pixels: dict[str, NDArray[np.float64]]
     residuals_px: dict[str, NDArray[np.float64]]
 
@@ -50,7 +60,7 @@ def put_together(
     lenses: Sequence[FittedLens],
     solved: Solved | None,
     mounted: Sequence[Mounted],
-    about: dict[str, Any],
+    clocks: ClocksRecord | None,
     settings: CalibrationSettings,
 ) -> Calibration:
     """Return a calibration from its parts.
@@ -65,8 +75,8 @@ def put_together(
         The fixed cameras, if there are any.
     mounted : sequence of Mounted
         The moving ones.
-    about : dict
-        What was decided on the way, for the provenance.
+    clocks : ClocksRecord or None
+        By how much the fixed ones were late, if that was asked.
     settings : CalibrationSettings
         How it was done.
     """
@@ -76,7 +86,8 @@ def put_together(
     views: Sequence[tuple[BundleView, NDArray[np.float64]]] = ()
     if solved is not None:
         views = list(zip(solved.adjusted.bundle.views, solved.adjusted.residuals_px, strict=True))
-    told = {}
+    told: dict[str, CameraRecord] = {}
+    mounts = {one.camera.name: one.told for one in mounted}
     for index, (seen, lens) in enumerate(zip(observations, lenses, strict=True)):
         own = [(view, missed) for view, missed in views if view.camera == index]
         clip = [
@@ -94,43 +105,52 @@ def put_together(
             found = is_seen(every)
             residuals[seen.name] = every[found]
             pixels[seen.name] = np.concatenate([view.pixels for view, _ in own])[found]
-        told[seen.name] = _told_of_camera(boards, seen, lens, alone, clip)
-    for one in mounted:
-        told[one.camera.name]["mount"] = one.told
+        told[seen.name] = _told_of_camera(boards, seen, lens, alone, clip, mounts.get(seen.name))
     noise = (
         solved.noise
         if solved is not None
         else Noise(lenses[0].noise_px, lenses[0].noise_px, lenses[0].rms_px, 1.0, 0, 0)
     )
-    provenance: dict[str, Any] = {
-        "method": "joint bundle adjustment of lenses, poses and boards",
-        "software": {
-            name: importlib.metadata.version(name)
-            for name in ("hybridve", "pycolmap", "opencv-python-headless")
-        },
-        "boards": [{"name": board.name, "body": board.body, "is": str(board)} for board in boards],
-        "rms_px": round(noise.rms_px, 4),
-        "noise": asdict(noise),
-        "cameras": told,
-        **about,
-        "settings": {"lens": asdict(settings.lens), "observe": asdict(settings.observe)},
-    }
-    if solved is not None:
-        provenance["adjustment"] = {
-            "steps": solved.adjusted.n_steps,
-            "views": len(views),
-            "outliers": len(solved.outliers),
-            "worst_outliers": solved.outliers[:_TOLD_OUTLIERS],
-            "left_out": dict(solved.linked.left_out),
-            "warnings": list(solved.linked.warnings),
-        }
     rig = Rig(
         cameras,
-        provenance,
         covariance=_whole_covariance(solved, mounted),
         mounts={one.camera.name: one.mount for one in mounted},
     )
-    return Calibration(rig, noise, pixels, residuals)
+    opinion = None
+    if solved is not None:
+        volume = working_volume(rig, settings.box_world)
+        opinion = second_opinion(rig, solved.second, volume.points_world)
+    record = CalibrationRecord(
+        method=METHOD,
+        software={
+            name: importlib.metadata.version(name)
+            for name in ("hybridve", "pycolmap", "opencv-python-headless")
+        },
+        boards=tuple(BoardRecord(board.name, board.body, str(board)) for board in boards),
+        rms_px=round(noise.rms_px, 4),
+        noise=noise,
+        cameras=told,
+        clocks=clocks,
+        labelling=None if solved is None else solved.labelling,
+        noise_by_group=None if solved is None else solved.noise_by_group,
+        world=None if solved is None else solved.world,
+        settings={"lens": asdict(settings.lens), "observe": asdict(settings.observe)},
+        adjustment=None if solved is None else _told_of_adjustment(solved),
+        second_opinion=opinion,
+    )
+    return Calibration(replace(rig, provenance=record), record, pixels, residuals)
+
+
+def _told_of_adjustment(solved: Solved) -> Adjustment:
+    return Adjustment(
+        steps=solved.adjusted.n_steps,
+        views=len(solved.adjusted.bundle.views),
+        outliers=len(solved.outliers),
+        worst_outliers=tuple(solved.outliers[:_TOLD_OUTLIERS]),
+        left_out=dict(solved.linked.left_out),
+        warnings=tuple(solved.linked.warnings),
+        start=solved.start,
+    )
 
 
 def _whole_covariance(solved: Solved | None, mounted: Sequence[Mounted]) -> RigCovariance:
@@ -144,7 +164,7 @@ def _whole_covariance(solved: Solved | None, mounted: Sequence[Mounted]) -> RigC
         names = camera_parameter_names(one.camera)
         labels += tuple(f"{one.camera.name} {name}" for name in names)
         block = np.zeros((len(names), len(names)))
-        block[:POSE, :POSE] = one.told["pose_covariance"]
+        block[:POSE, :POSE] = one.told.pose_covariance
         blocks.append((block + block.T) / 2.0)
     size = sum(map(len, blocks))
     matrix = np.zeros((size, size))
@@ -162,44 +182,47 @@ def _told_of_camera(
     lens: FittedLens,
     stills: Sequence[NDArray[np.float64]],
     clip: Sequence[NDArray[np.float64]],
-) -> dict[str, Any]:
-    """Return where one camera's numbers come from, as plain JSON values."""
-    extrinsics = {
-        "source": seen.sources.get("extrinsics"),
-        "corners_by_hand": seen.sources.get("corners"),
-        **_errors(clip),
-        "how": seen.how,
-    }
-    if seen.spread_px is not None and np.isfinite(seen.spread_px):
-        extrinsics["spread_over_clip_px"] = round(seen.spread_px, 4)
+    mount: MountRecord | None,
+) -> CameraRecord:
+    """Return where one camera's numbers come from."""
+    spread_px = seen.spread_px
+    if spread_px is not None:
+        spread_px = round(spread_px, 4) if np.isfinite(spread_px) else None
     tilt = other_tilt(boards, lens.camera, seen) if seen.is_still else None
-    if tilt is not None:
-        extrinsics["other_tilt_times_worse"] = round(tilt, 2)
-    told: dict[str, Any] = {
-        "model": lens.camera.model,
-        "intrinsics": {
-            "source": seen.sources.get("intrinsics"),
-            **_errors(stills),
-            "views_dropped": lens.dropped,
-            "views_without_board": seen.missed,
-            "outliers": len(lens.outliers),
-        },
-        "extrinsics": extrinsics,
-        "warnings": list(lens.warnings),
-        "notes": list(seen.notes),
-    }
-    if lens.choice is not None:
-        told["model_chosen"] = lens.choice
-    return told
+    stills_rms_px, stills_max_px = _errors(stills)
+    clip_rms_px, clip_max_px = _errors(clip)
+    return CameraRecord(
+        model=lens.camera.model,
+        intrinsics=StillsRecord(
+            source=seen.sources.get("intrinsics"),
+            views_used=len(stills),
+            rms_px=stills_rms_px,
+            max_px=stills_max_px,
+            views_dropped=lens.dropped,
+            views_without_board=seen.missed,
+            outliers=len(lens.outliers),
+        ),
+        extrinsics=ClipRecord(
+            source=seen.sources.get("extrinsics"),
+            corners_by_hand=seen.sources.get("corners"),
+            views_used=len(clip),
+            rms_px=clip_rms_px,
+            max_px=clip_max_px,
+            how=seen.how,
+            spread_over_clip_px=spread_px,
+            other_tilt_times_worse=None if tilt is None else round(tilt, 2),
+        ),
+        warnings=tuple(lens.warnings),
+        notes=tuple(seen.notes),
+        model_chosen=lens.choice,
+        mount=mount,
+    )
 
 
-def _errors(residuals: Sequence[NDArray[np.float64]]) -> dict[str, Any]:
+def _errors(residuals: Sequence[NDArray[np.float64]]) -> tuple[float | None, float | None]:
+    """Return the rms and the largest length of residuals (N, 2) of views, pixels, rounded."""
     if not residuals:
-        return {"views_used": 0, "rms_px": None, "max_px": None}
+        return None, None
     every = np.concatenate(residuals)
     every = every[is_seen(every)]
-    return {
-        "views_used": len(residuals),
-        "rms_px": round(rms(every), 4),
-        "max_px": round(float(np.linalg.norm(every, axis=1).max()), 3),
-    }
+    return round(rms(every), 4), round(float(np.linalg.norm(every, axis=1).max()), 3)

@@ -17,10 +17,10 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.judging.twins import find_twins, twins_text
 from hybridve.calib.lens import cam_from_img, parameter_names
 from hybridve.calib.pose import invert, transform
+from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.covariance import (
-    Noise,
     image_derivatives,
     parameter_slices,
     pixel_covariance,
@@ -202,6 +202,8 @@ class Certificate:
     doubts : tuple of str
         Those among them that make the stated errors void: what the pictures show contradicts itself
         or leaves the rig open. A quality gate must not pass such a rig.
+    second_opinion : SecondOpinion, NoOpinion or None
+        By how much COLMAP's own adjustment differs; None where all cameras move.
     """
 
     verdict: str
@@ -216,6 +218,7 @@ class Certificate:
     limit: Limit | None
     warnings: tuple[str, ...]
     doubts: tuple[str, ...] = ()
+    second_opinion: SecondOpinion | NoOpinion | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain JSON values; NaN becomes None."""
@@ -294,17 +297,19 @@ def _look_at(rig: Rig) -> NDArray[np.float64]:
     return np.asarray(centers.mean(axis=0) + axes * max(2.0 * float(spread), 1.0))
 
 
-def certify(rig: Rig, seen: Mapping[str, SeenPoints], noise: Noise, volume: Volume) -> Certificate:
+def certify(
+    rig: Rig, record: CalibrationRecord, seen: Mapping[str, SeenPoints], volume: Volume
+) -> Certificate:
     """Return the verdict on a rig.
 
     Parameters
     ----------
     rig : Rig
         With its covariance.
+    record : CalibrationRecord
+        What its calibration found and doubted; of a rig without one nothing can be certified.
     seen : mapping of str to SeenPoints
         By camera what it saw of the boards.
-    noise : Noise
-        How noisy that was.
     volume : Volume
         Where the rig is judged.
     """
@@ -317,7 +322,7 @@ def certify(rig: Rig, seen: Mapping[str, SeenPoints], noise: Noise, volume: Volu
         _certify_camera(rig, index, seen.get(camera.name), volume)
         for index, camera in enumerate(rig.cameras)
     )
-    doubts = _doubts(rig)
+    doubts = _doubts(rig, record)
     verdict = _verdict(error95_m, cameras, limit)
     if doubts:
         verdict = f"not to be trusted: {doubts[0]} Without this doubt: {verdict}"
@@ -329,11 +334,12 @@ def certify(rig: Rig, seen: Mapping[str, SeenPoints], noise: Noise, volume: Volu
         volume_low_m=tuple(float(value) for value in volume.low_world),
         volume_high_m=tuple(float(value) for value in volume.high_world),
         volume_min_cameras=volume.min_cameras,
-        noise=noise,
+        noise=record.noise,
         cameras=cameras,
         limit=limit,
-        warnings=doubts + _warnings(rig, cameras, noise),
+        warnings=doubts + _warnings(record, cameras),
         doubts=doubts,
+        second_opinion=record.second_opinion,
     )
 
 
@@ -504,8 +510,8 @@ def _largest(moves_px: NDArray[np.float64]) -> float:
     return float(np.quantile(lengths, _SHARE)) if len(lengths) else 0.0
 
 
-def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> tuple[str, ...]:
-    warnings = []
+def _warnings(record: CalibrationRecord, cameras: Sequence[CameraCertificate]) -> tuple[str, ...]:
+    warnings, noise = [], record.noise
     for told in cameras:
         if told.undetermined:
             names = " and ".join(told.undetermined)
@@ -522,25 +528,28 @@ def _warnings(rig: Rig, cameras: Sequence[CameraCertificate], noise: Noise) -> t
             'parameters (or model = "auto"), a flatter board or sharper pictures would fit '
             "better; the stated errors allow for it"
         )
-    if len(rig.cameras) == 1:
+    if len(cameras) == 1:
         warnings.append("one camera alone places no point in space: no error in mm is stated")
-    warnings += rig.provenance.get("world", {}).get("warnings", [])
-    return tuple(warnings)
+    return (*warnings, *record.warnings)
 
 
-def _doubts(rig: Rig) -> tuple[str, ...]:
+def _doubts(rig: Rig, record: CalibrationRecord) -> tuple[str, ...]:
     """Return what a calibration found to contradict itself, or could not decide."""
-    doubts = list(rig.provenance.get("adjustment", {}).get("warnings", []))
     # One clip that was given twice counts as two: the errors that are stated are too small.
-    if twins := twins_text(find_twins(rig)):
-        doubts.append(f"{twins}.")
-    if rig.provenance.get("labelling", {}).get("is_weak", False):
-        doubts.append(
-            "the board looks the same when turned, and hardly anything tells which way round each "
-            "camera saw it; mark the corners by hand in one order, move the board, or use one with "
-            "an odd sum of columns and rows."
-        )
-    return tuple(doubts)
+    twins = twins_text(find_twins(rig))
+    return (*record.doubts, f"{twins}.") if twins else record.doubts
+
+
+def opinion_text(opinion: SecondOpinion | NoOpinion) -> str:
+    """Return a second opinion in words."""
+    if isinstance(opinion, NoOpinion):
+        return f"no second opinion: {opinion.reason}"
+    return (
+        "second opinion: COLMAP's own adjustment places what the cameras see within "
+        f"{millimetres(opinion.difference95_m)} mm of where the rig does (95 %), or "
+        f"{opinion.sigmas:.1f} standard deviations of its error, which is "
+        f"{millimetres(opinion.expected95_m)} mm (95 %)"
+    )
 
 
 def millimetres(length_m: float) -> str:

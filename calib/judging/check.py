@@ -21,7 +21,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ from hybridve.calib.judging.comparison import (
     root_of,
     variance_of,
 )
-from hybridve.calib.judging.turns import ListedView, Turned, Turns, judge_turns
+from hybridve.calib.judging.turns import ListedView, Turns, judge_turns
 from hybridve.calib.judging.twins import find_twins, twins_text
 from hybridve.calib.pose import Pose, angle_between, compose, invert, transform
 from hybridve.calib.rig import Rig
@@ -51,6 +50,7 @@ from hybridve.calib.solving.placement import (
     place_boards,
     residuals_of,
 )
+from hybridve.calib.verdict import Moved, RigCheck
 
 #: Boards contradict a rig that has no covariance beyond these: the rig's scale by more than 5 %
 #: (independent careful calibrations of one recording differ by up to 4 %), or its corners by more
@@ -113,106 +113,8 @@ _PROPOSAL_POINTS = 12
 _EXPLAINS = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Moved:
-    """A camera that is not as the rig says.
-
-    Attributes
-    ----------
-    what : str
-        "pose", "lens" (the focal length: a zoom), or "pose and lens".
-    shift_mm, turn_deg : float
-        How far its centre lies from where the rig says, in true millimetres, and by how much it is
-        turned; zero where the lens alone explains what it sees.
-    focal_factor : float
-        How many times longer the focal lengths are than the rig says; 1 where they are as it says.
-    miss_px : float
-        How far its image of the boards lies from where the rig says, pixels.
-    p_value : float or None
-        How often chance makes a camera that has not been touched look as bad; None where the rig
-        does not know its own errors.
-    """
-
-    what: str
-    shift_mm: float
-    turn_deg: float
-    focal_factor: float
-    miss_px: float
-    p_value: float | None
-
-
 class NotTestableError(CalibrationError):
     """Nothing was seen by which a rig could be tested: it is neither right nor wrong."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigCheck:
-    """What boards say of a rig.
-
-    Attributes
-    ----------
-    scale : float
-        How many times too large the rig is: the boards' squares as the rig measures them, by the
-        squares as they are. 1 where all cameras stand in one place: it cannot be told.
-    pair_scales : dict of str to float
-        The same from the distance of each two cameras alone, "cam1 cam2"; they differ where the
-        rig is wrong by more than its scale. Without those that stand in one place.
-    rms_px : dict of str to float
-        How far corners lie from where the rig, at the scale found, says: per camera, pixels.
-        Boards are placed by the cameras that agree.
-    odd_camera : str or None
-        The camera without which the others agree, if it is a single one.
-    is_trustworthy : bool
-        Whether scale and cameras are known to be within what is allowed.
-    is_refuted : bool
-        Whether they are known not to be. Neither: nothing tells whether cameras of the rig are
-        turned about a board.
-    message : str
-        The verdict in one line.
-    moved : dict of str to Moved
-        The cameras without which the others agree.
-    suspects : tuple of str
-        Cameras of which one, or more, are not as the rig says, but it cannot be told which.
-    exchanged : tuple of (str, str), or None
-        Two cameras whose pictures are exchanged.
-    turned : dict of str to Turned
-        Cameras that fit the boards, but stand turned about one that looks the same when turned.
-    turned_sides : tuple of tuple of str
-        All of those; or, where it may as well be others of as many cameras, these sides, of which
-        one stands as the rig says.
-    undecided : tuple of str
-        Cameras of which nothing tells whether they stand so.
-    twins : tuple of tuple of str
-        Cameras of the rig at one place with one view, by the group.
-    untested : tuple of str
-        Cameras of the rig that saw no board together with others.
-    p_value : float or None
-        How often chance makes a rig that has not been touched look as bad, its scale apart; None
-        where the rig does not know its own errors.
-    scale_sigma : float or None
-        Standard deviation of `scale`, likewise.
-    n_placements : int
-        How many boards at how many moments it rests on.
-    """
-
-    scale: float
-    pair_scales: dict[str, float]
-    rms_px: dict[str, float]
-    odd_camera: str | None
-    is_trustworthy: bool
-    is_refuted: bool
-    message: str
-    moved: dict[str, Moved]
-    suspects: tuple[str, ...]
-    exchanged: tuple[str, str] | None
-    turned: dict[str, Turned]
-    turned_sides: tuple[tuple[str, ...], ...]
-    undecided: tuple[str, ...]
-    twins: tuple[tuple[str, ...], ...]
-    untested: tuple[str, ...]
-    p_value: float | None
-    scale_sigma: float | None
-    n_placements: int
 
 
 def check_rig(rig: Rig, boards: Sequence[Board], observations: Sequence[Observations]) -> RigCheck:
@@ -262,24 +164,6 @@ def _exchange(
     exchanged = dict(sightings)
     exchanged[first], exchanged[second] = sightings[second], sightings[first]
     return exchanged
-
-
-def check_from_dict(told: Mapping[str, Any]) -> RigCheck:
-    """Return what `dataclasses.asdict` made plain, and JSON may have kept."""
-    pair = told["exchanged"]
-    return RigCheck(
-        **{
-            **told,
-            "moved": {name: Moved(**one) for name, one in told["moved"].items()},
-            "turned": {name: Turned(**one) for name, one in told["turned"].items()},
-            "turned_sides": tuple(tuple(side) for side in told["turned_sides"]),
-            "twins": tuple(tuple(group) for group in told["twins"]),
-            "suspects": tuple(told["suspects"]),
-            "undecided": tuple(told["undecided"]),
-            "untested": tuple(told["untested"]),
-            "exchanged": None if pair is None else (pair[0], pair[1]),
-        }
-    )
 
 
 # --- What was seen ----------------------------------------------------------------------------

@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Observations
-from hybridve.calib.placing.labelling import CLEAR_EVIDENCE, WEAK_EVIDENCE, votes_for_looks
+from hybridve.calib.placing.labelling import WEAK_EVIDENCE, votes_for_looks
+from hybridve.calib.placing.mirrored import CLEAR_EVIDENCE
 from hybridve.calib.placing.surroundings import LooksByVote, choose_looks, sigmas_apart
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.placement import Placed, imaged
+from hybridve.calib.verdict import Turned
 
 #: Boards in two places exclude a turn if it would move one of them in an image by so many times
 #: what a camera may miss: each of two cameras between which it is placed shows half of that, and
@@ -49,25 +51,6 @@ class ListedView:
     place: int
     board: int
     look: int
-
-
-@dataclass(frozen=True, slots=True)
-class Turned:
-    """A camera that stands turned about a board.
-
-    Attributes
-    ----------
-    turn_deg : float
-        By how much: 90 or 180 degrees.
-    shift_m : float
-        How far the rig has it from where it is, metres.
-    sigma : float
-        By how many standard deviations of chance matches the scene says so.
-    """
-
-    turn_deg: float
-    shift_m: float
-    sigma: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,8 @@ its answer, and adds the noise by kind of view, boards on bodies, shared lenses 
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,15 +22,16 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.placing.labelling import label_still_boards
 from hybridve.calib.placing.link import Linked, link_cameras
+from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
-from hybridve.calib.placing.world import Mark, SeenBoards, place_world
+from hybridve.calib.placing.world import SeenBoards, place_world
 from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.record import Labelling, Noise, Outlier, WorldRecord
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose
 from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.consensus import common_pose
 from hybridve.calib.solving.covariance import (
-    Noise,
     even_covariance,
     in_world,
     measure_group_noise,
@@ -73,10 +73,10 @@ _LEAST_SIGMA_PX = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """Fixed cameras in the world, and what they were adjusted to.
+    """Fixed cameras in the world, what they were adjusted to, and what was decided on the way.
 
-    `second` is the same rig as COLMAP's own adjustment has it, with the covariance that this has
-    for the noise that was found; or why there is none, as a sentence.
+    `second` is the same rig as COLMAP's own adjustment has it, with the errors of that for the
+    noise that was found; or why there is none, as a sentence. `start` says what ours started from.
     """
 
     adjusted: Adjusted
@@ -85,8 +85,12 @@ class Solved:
     cameras: tuple[Camera, ...]
     covariance: RigCovariance
     world_from_rig: Pose
-    outliers: list[dict[str, Any]]
+    outliers: list[Outlier]
+    noise_by_group: dict[str, Noise]
+    labelling: Labelling | None
+    world: WorldRecord
     second: Rig | str
+    start: str
 
 
 def solve_fixed(
@@ -95,7 +99,6 @@ def solve_fixed(
     lenses: Sequence[FittedLens],
     requests: Mapping[str, LensRequest],
     settings: CalibrationSettings,
-    about: dict[str, Any],
     shares: Mapping[str, float],
 ) -> Solved:
     """Link fixed cameras, adjust them with all they saw, and place them in the world.
@@ -110,8 +113,6 @@ def solve_fixed(
         By camera what is asked of its lens.
     settings : CalibrationSettings
         How it is done.
-    about : dict
-        What is decided on the way is put here, for the provenance.
     shares : mapping of str to float
         By camera the noise of interpolated points by that of frames
         (`hybridve.calib.placing.clock.noise_shares`).
@@ -123,13 +124,14 @@ def solve_fixed(
     """
     is_still = all(seen.is_still for seen in observations)
     seen: Sequence[Observations] = observations
+    labelling = None
     if is_still:
         cameras = [lens.camera for lens in lenses]
-        seen, about["labelling"] = label_still_boards(boards, cameras, observations)
+        seen, labelling = label_still_boards(boards, cameras, observations)
         _warn_of_flat_views(boards, cameras, seen)
     elif any(len(board.looks) > 1 for board in boards):
         looks = max(len(board.looks) for board in boards)
-        about["labelling"] = {"looks": looks, "decided_by": "poses common to all frames"}
+        labelling = Labelling(looks=looks, decided_by="poses common to all frames")
     linked = link_cameras(boards, lenses, seen, is_labelled=is_still)
     bundle = make_bundle(boards, lenses, linked, requests)
     first = colmap_adjust(bundle, settings.lens.loss_px)
@@ -144,15 +146,13 @@ def solve_fixed(
     adjusted, noise, groups = adjust_weighed(
         cleaned if isinstance(theirs, str) else theirs, linked, shares
     )
-    about["noise_by_group"] = {name: asdict(told) for name, told in groups.items()}
     placed = place_world(
         settings.world,
         adjusted.bundle.cameras,
         _seen_boards(boards, linked, adjusted.bundle),
         settings.marks,
     )
-    about["world"] = placed.diagnostics
-    for warning in placed.diagnostics["warnings"]:
+    for warning in placed.told.warnings:
         logger.warning("%s", warning)
     in_the_world = _in_world(adjusted.bundle.cameras, placed.world_from_rig)
     covariance, even = rig_covariance(adjusted, 1.0), even_covariance(adjusted.bundle)
@@ -171,7 +171,18 @@ def solve_fixed(
         world_from_rig = _world_of(boards, linked, theirs, settings, placed.world_from_rig)
         second = Rig(_in_world(theirs.cameras, world_from_rig), covariance=even)
     return Solved(
-        adjusted, linked, noise, in_the_world, covariance, placed.world_from_rig, outliers, second
+        adjusted,
+        linked,
+        noise,
+        in_the_world,
+        covariance,
+        placed.world_from_rig,
+        outliers,
+        groups,
+        labelling,
+        placed.told,
+        second,
+        f"linked cameras: {first}" if isinstance(first, str) else "COLMAP's adjustment",
     )
 
 
@@ -445,7 +456,7 @@ def other_tilt(boards: Sequence[Board], camera: Camera, seen: Observations) -> f
     return max(factors, default=None)
 
 
-def without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
+def without_outliers(rough: Adjusted) -> tuple[Bundle, list[Outlier]]:
     """Return a bundle without the points that miss by far, and these, the worst first."""
     bundle = rough.bundle
     limits_px = []
@@ -462,7 +473,7 @@ def without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
         sigma_px = 1.4826 * float(np.median(np.abs(missed))) if len(missed) else 0.0
         limits_px.append(max(_OUTLIER_SIGMAS * sigma_px, _OUTLIER_PX))
     views: list[BundleView] = []
-    outliers: list[dict[str, Any]] = []
+    outliers: list[Outlier] = []
     for view, residuals in zip(bundle.views, rough.residuals_px, strict=True):
         misses_px = np.linalg.norm(residuals, axis=1)
         with np.errstate(invalid="ignore"):
@@ -470,16 +481,16 @@ def without_outliers(rough: Adjusted) -> tuple[Bundle, list[dict[str, Any]]]:
         if is_outlier.sum() > len(residuals) / 4:
             is_outlier[:] = False  # a whole view is judged by its lens and by the other views
         outliers += [
-            {
-                "camera": bundle.cameras[view.camera].name,
-                "image": view.image,
-                "board": view.board,
-                "point": int(point),
-                "missed_px": round(float(misses_px[point]), 2),
-            }
+            Outlier(
+                bundle.cameras[view.camera].name,
+                view.image,
+                view.board,
+                int(point),
+                round(float(misses_px[point]), 2),
+            )
             for point in np.flatnonzero(is_outlier)
         ]
         pixels = np.where(is_outlier[:, None], np.nan, view.pixels)
         views.append(replace(view, pixels=pixels))
-    outliers.sort(key=lambda told: -told["missed_px"])
+    outliers.sort(key=lambda told: -told.missed_px)
     return replace(bundle, views=tuple(views)), outliers

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.camera import Camera
@@ -10,6 +9,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.fixed_cameras import Solved
 from hybridve.calib.placing.hand_eye import mount_camera
 from hybridve.calib.pose import Pose, compose
+from hybridve.calib.record import MountRecord
 from hybridve.calib.rig import Mount
 from hybridve.calib.solving.lens_fit import FittedLens
 
@@ -20,7 +20,7 @@ class Mounted:
 
     camera: Camera
     mount: Mount
-    told: dict[str, Any]
+    told: MountRecord
 
 
 def mount(
@@ -42,7 +42,7 @@ def mount(
     world_from_board = None if solved is None else _still_boards(boards, seen, solved)
     mount, told = mount_camera(lens.camera, boards, seen.sightings, track, world_from_board)
     # A moving camera stands in the rig where it was in the middle of its clip.
-    middle = mount.cam_from_world(track[told["middle_instant"]])
+    middle = mount.cam_from_world(track[told.middle_instant])
     return Mounted(replace(lens.camera, cam_from_world=middle), mount, told)
 
 

@@ -9,10 +9,9 @@ This work is based on: Hartley and Zisserman, *Multiple View Geometry*, 2nd ed.,
 patterns*, IEEE Trans. PAMI 13(4), 1991.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,9 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Board
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.lens import cam_from_img
+from hybridve.calib.placing.marks import Mark, click_warnings, rounded, triangulated
 from hybridve.calib.pose import Pose, compose, invert, transform
+from hybridve.calib.record import WorldRecord
 from hybridve.calib.solving.bundle import BundleView
 
 #: The rig's scale by the named points: what is worth a warning, and what no measurement explains.
@@ -38,36 +38,6 @@ _FLAT = 2e-2
 _POOR_FIT = 0.02
 _EXPLAINS_FACTOR = 5.0
 
-#: A click that misses its point by more than this share of the image's width is worth a warning.
-_CLICK_SHARE = 0.01
-
-#: Rays that meet at a smaller angle (radians) tell no distance.
-_MIN_ANGLE_RAD = 5e-3
-
-_TRIANGULATION_STEPS = 10
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mark:
-    """A point of the scene, clicked in several cameras.
-
-    Attributes
-    ----------
-    name : str
-        For messages.
-    pixels : mapping of str to (x, y)
-        By camera, pixel centre at 0.5.
-    xyz_m : (3,) float64, or None
-        Where it is in the world, metres.
-    is_floor : bool
-        Whether it lies on the floor.
-    """
-
-    name: str
-    pixels: Mapping[str, tuple[float, float]]
-    xyz_m: NDArray[np.float64] | None = None
-    is_floor: bool = False
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
@@ -77,12 +47,12 @@ class Placed:
     ----------
     world_from_rig : (3, 4) float64
         Metres.
-    diagnostics : dict
-        Plain JSON values: "kind", "text", "warnings", and what the kind tells (residuals in mm).
+    told : WorldRecord
+        What it was placed by.
     """
 
     world_from_rig: Pose
-    diagnostics: dict[str, Any]
+    told: WorldRecord
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,14 +166,14 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
     )
     return Placed(
         world_from_rig,
-        {
-            "kind": "board",
-            "text": text,
-            "board": str(seen.boards[board]),
-            "instant": instant,
-            "cameras": sorted(cameras[index].name for index in seeing),
-            "warnings": warnings,
-        },
+        WorldRecord(
+            kind="board",
+            text=text,
+            board=str(seen.boards[board]),
+            instant=instant,
+            cameras=tuple(sorted(cameras[index].name for index in seeing)),
+            warnings=tuple(warnings),
+        ),
     )
 
 
@@ -223,7 +193,7 @@ def place_by_points(cameras: Sequence[Camera], marks: Sequence[Mark]) -> Placed:
         If there are too few points, they lie on a line, their names are exchanged, they are
         mirrored, their distances contradict the rig's scale, or cameras come out under the floor.
     """
-    points_rig, misses_px = _triangulated(cameras, marks)
+    points_rig, misses_px = triangulated(cameras, marks)
     if len(marks) < 3:
         raise CalibrationError(
             f"the world needs 3 named points or more, found {len(marks)}: "
@@ -261,7 +231,7 @@ def place_by_points(cameras: Sequence[Camera], marks: Sequence[Mark]) -> Placed:
         raise _under_floor(
             [cameras[index] for index in wrong], [heights[index] for index in wrong], cause
         )
-    warnings = _click_warnings(cameras, marks, misses_px)
+    warnings = click_warnings(cameras, marks, misses_px)
     if abs(scale - 1.0) > SCALE_WARNING:
         warnings.append(
             f"the named points are {scale:.3f} times as far apart in the rig as their xyz says: "
@@ -269,17 +239,17 @@ def place_by_points(cameras: Sequence[Camera], marks: Sequence[Mark]) -> Placed:
         )
     return Placed(
         world_from_rig,
-        {
-            "kind": "points",
-            "text": f"{len(marks)} named points",
-            "residuals_mm": {
+        WorldRecord(
+            kind="points",
+            text=f"{len(marks)} named points",
+            residuals_mm={
                 mark.name: round(float(residual), 3)
                 for mark, residual in zip(marks, residuals_mm, strict=True)
             },
-            "scale": round(scale, 5),
-            "misses_px": _rounded(misses_px),
-            "warnings": warnings,
-        },
+            scale=round(scale, 5),
+            misses_px=rounded(misses_px),
+            warnings=tuple(warnings),
+        ),
     )
 
 
@@ -308,7 +278,7 @@ def place_on_floor(
     """
     misses_px: dict[str, dict[str, float]] = {}
     if marks:
-        floor_rig, misses_px = _triangulated(cameras, marks)
+        floor_rig, misses_px = triangulated(cameras, marks)
         names = [mark.name for mark in marks]
     else:
         floor_rig, names = _still_corners(seen)
@@ -353,91 +323,15 @@ def place_on_floor(
     )
     return Placed(
         np.column_stack([rotation, -rotation @ foot]),
-        {
-            "kind": "floor",
-            "text": f"the floor through {len(names) if marks else 'the boards on it'}"
+        WorldRecord(
+            kind="floor",
+            text=f"the floor through {len(names) if marks else 'the boards on it'}"
             + (" points" if marks else ""),
-            "residuals_mm": told,
-            "misses_px": _rounded(misses_px),
-            "warnings": _click_warnings(cameras, marks, misses_px),
-        },
+            residuals_mm=told,
+            misses_px=rounded(misses_px),
+            warnings=tuple(click_warnings(cameras, marks, misses_px)),
+        ),
     )
-
-
-def triangulate(
-    cameras: Sequence[Camera], pixels: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the point that several cameras see, with the least squared error in their images.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        At least two.
-    pixels : (C, 2) float64
-        Where each sees it, pixel centre at 0.5.
-
-    Returns
-    -------
-    point_world : (3,) float64
-        NaN where a camera has no ray there, the rays are as good as parallel, or meet behind a
-        camera.
-    misses_px : (C,) float64
-        By how far each camera misses it.
-    """
-    nowhere = np.full(3, np.nan), np.full(len(cameras), np.nan)
-    rays = np.stack([cam_from_img(camera, pixels[i, None])[0] for i, camera in enumerate(cameras)])
-    if not np.isfinite(rays).all():
-        return nowhere
-    focal_px = np.array([camera.pinhole[0, 0] for camera in cameras])
-    poses = np.stack([camera.cam_from_world for camera in cameras])
-    directions = np.einsum(
-        "cji,cj->ci", poses[:, :, :3], np.column_stack([rays, np.ones(len(rays))])
-    )
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    spread = np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=2)
-    if spread.max() < _MIN_ANGLE_RAD:
-        return nowhere
-    # Start where the rays pass nearest to one another, in space.
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    centers = np.array([camera.center_world for camera in cameras])
-    point = np.linalg.solve(across.sum(axis=0), np.einsum("cij,cj->i", across, centers))
-    residuals = np.zeros((len(cameras), 2))
-    for _ in range(_TRIANGULATION_STEPS):
-        points_cam = poses[:, :, :3] @ point + poses[:, :, 3]
-        if (points_cam[:, 2] <= 0).any():
-            return nowhere
-        flat = points_cam[:, :2] / points_cam[:, 2:]
-        residuals = focal_px[:, None] * (rays - flat)
-        slopes = (poses[:, :2, :3] - flat[:, :, None] * poses[:, 2:, :3]) / points_cam[:, 2:, None]
-        jacobian = (focal_px[:, None, None] * slopes).reshape(-1, 3)
-        point = point + np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
-    return np.asarray(point), np.linalg.norm(residuals, axis=1)
-
-
-def _triangulated(
-    cameras: Sequence[Camera], marks: Sequence[Mark]
-) -> tuple[NDArray[np.float64], dict[str, dict[str, float]]]:
-    """Return the marks' places (M, 3) in the rig, and by mark and camera how far it is missed."""
-    by_name = {camera.name: camera for camera in cameras}
-    points = np.zeros((len(marks), 3))
-    misses: dict[str, dict[str, float]] = {}
-    for index, mark in enumerate(marks):
-        names = sorted(name for name in mark.pixels if name in by_name)
-        if len(names) < 2:
-            raise CalibrationError(
-                f"point {mark.name!r} is seen by {len(names)} camera of the rig; mark it in 2 or "
-                "more"
-            )
-        pixels = np.array([mark.pixels[name] for name in names], np.float64)
-        points[index], missed_px = triangulate([by_name[name] for name in names], pixels)
-        if not np.isfinite(points[index]).all():
-            raise CalibrationError(
-                f"point {mark.name!r}: the rays of {', '.join(map(repr, names))} do not meet "
-                "before them; is it clicked at the same place in each picture, and are the cameras "
-                "far enough apart?"
-            )
-        misses[mark.name] = dict(zip(names, map(float, missed_px), strict=True))
-    return points, misses
 
 
 def _still_corners(seen: SeenBoards) -> tuple[NDArray[np.float64], list[str]]:
@@ -531,28 +425,3 @@ def _under_floor(
     )
     plural = "s" if len(cameras) > 1 else ""
     return CalibrationError(f"camera{plural} {told} came out under the floor: {cause}")
-
-
-def _click_warnings(
-    cameras: Sequence[Camera],
-    marks: Sequence[Mark],
-    misses_px: Mapping[str, Mapping[str, float]],
-) -> list[str]:
-    widths = {camera.name: camera.width_px for camera in cameras}
-    warnings = []
-    for mark in marks:
-        missed = misses_px[mark.name]
-        worst = max(missed, key=lambda name: missed[name] / widths[name])
-        if missed[worst] > _CLICK_SHARE * widths[worst]:
-            warnings.append(
-                f"point {mark.name!r}: the rays of {', '.join(map(repr, sorted(missed)))} miss one "
-                f"another by {missed[worst]:.1f} px (in {worst!r}); is it the same place in each?"
-            )
-    return warnings
-
-
-def _rounded(misses_px: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
-    return {
-        point: {camera: round(missed, 2) for camera, missed in missed_px.items()}
-        for point, missed_px in misses_px.items()
-    }

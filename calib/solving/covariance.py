@@ -22,6 +22,7 @@ from hybridve.calib.boards.board import is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, img_from_cam, parameter_names
 from hybridve.calib.pose import Pose, transform
+from hybridve.calib.record import Noise
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import (
     POSE,
@@ -64,33 +65,6 @@ _ONE_RAY = 1e-12
 
 #: Points of a pixel grid over an image, a side, for the error within the image.
 _IMAGE_POINTS = 9
-
-
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """How noisy the points of boards were.
-
-    Attributes
-    ----------
-    rough_px : float
-        Standard deviation of a coordinate from point to point: the noise of finding points.
-    smooth_px : float
-        The same as the smooth part of the residuals shows it; what moves the parameters. Equal to
-        `rough_px` where model and boards are right.
-    rms_px : float
-        Root mean square length of the residuals.
-    share_explained : float
-        Share of the sum of squares that the noise of single points explains, up to 1.
-    n_points, n_parameters : int
-        Points seen, and parameters adjusted to them.
-    """
-
-    rough_px: float
-    smooth_px: float
-    rms_px: float
-    share_explained: float
-    n_points: int
-    n_parameters: int
 
 
 def measure_noise(adjusted: Adjusted) -> Noise:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.record import CandidateLens, LensChoice
 from hybridve.calib.solving.lens_fit import (
     Batch,
     Fit,
@@ -134,9 +135,7 @@ def choose_lens(
     Returns
     -------
     FittedLens
-        ``choice`` says why: ``model``, ``reason`` (one line), ``sigma_px``, ``inflation``,
-        ``n_effective``, and by candidate ``bic`` (above the lowest), ``rms_px``, ``n_params`` and
-        ``unseen`` (the share of the image where the lens sees nothing).
+        Its ``choice`` says why.
 
     Raises
     ------
@@ -182,22 +181,22 @@ def choose_shared_lens(
     refuse_degenerate(seen, batch, final)
     lowest = min(bics.values())
     fitted = share_out(boards, seen, views, unusable, batch, final, is_free=True)
-    choice = {
-        "model": chosen.model,
-        "reason": _reason(chosen, bics, fitted[0].sigmas),
-        "sigma_px": sigma_px,
-        "inflation": inflation,
-        "n_effective": n_values / inflation,
-        "candidates": {
-            candidate.model: {
-                "bic": float(bics[candidate.model] - lowest),
-                "rms_px": candidate.rms_px,
-                "n_params": N_PARAMS[candidate.model],
-                "unseen": candidate.unseen,
-            }
+    choice = LensChoice(
+        chosen.model,
+        _reason(chosen, bics, fitted[0].sigmas),
+        sigma_px,
+        inflation,
+        n_values / inflation,
+        {
+            candidate.model: CandidateLens(
+                float(bics[candidate.model] - lowest),
+                candidate.rms_px,
+                N_PARAMS[candidate.model],
+                candidate.unseen,
+            )
             for candidate in sorted(candidates, key=lambda each: bics[each.model])
         },
-    }
+    )
     extra: tuple[str, ...] = ()
     if chosen.unseen > _UNSEEN_TOLD:
         extra = (

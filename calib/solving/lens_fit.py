@@ -15,7 +15,6 @@ Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle adjustment: a modern synthes
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,6 +27,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.lens import cam_from_img, img_from_cam
 from hybridve.calib.pose import Pose, angle_between, transform
+from hybridve.calib.record import LensChoice
 from hybridve.calib.solving.bundle import lens_derivatives
 
 logger = logging.getLogger(__name__)
@@ -187,8 +187,8 @@ class FittedLens:
         Root mean square length of the residuals of the corners that were used.
     sigmas : (P,) float64
         Standard deviation of each parameter for that noise; 0 where it was given.
-    choice : dict or None
-        Why this model, if it was chosen: plain JSON values.
+    choice : LensChoice or None
+        Why this model, if it was chosen.
     """
 
     camera: Camera
@@ -200,7 +200,7 @@ class FittedLens:
     noise_px: float
     rms_px: float
     sigmas: NDArray[np.float64]
-    choice: dict[str, Any] | None = None
+    choice: LensChoice | None = None
 
 
 def are_finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:

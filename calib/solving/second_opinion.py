@@ -9,62 +9,22 @@ chance: one of the two is wrong, or the noise is not what it was taken for.
 This work is based on: Hausman, *Specification tests in econometrics*, Econometrica 46(6), 1978.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import project_points
+from hybridve.calib.record import NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.covariance import image_derivatives, point_gains, radius95
 
 #: The opinion is that of this share of the points.
 _SHARE = 0.95
 
-#: A difference beyond the stated error is no chance from so many standard deviations on, and no
-#: rounding if images differ by more than this (pixels): points without noise state next to none.
-_DISAGREES_SIGMAS = 4.0
-_NEGLIGIBLE_PX = 0.01
 
-
-@dataclass(frozen=True, slots=True)
-class SecondOpinion:
-    """What another adjustment of the same points says of a rig.
-
-    Attributes
-    ----------
-    reason : str
-        Why there is none, as a sentence; empty where there is one.
-    difference95_m : float
-        How far apart the two place a point that both see, but for the 5 % of the working volume
-        where they differ most; NaN where there is no opinion.
-    expected95_m : float
-        The same for the most that chance makes of it: the stated error (95 %) of the other
-        adjustment.
-    sigmas : float
-        The difference in standard deviations of that error.
-    difference95_px : float
-        How far apart the two have a point in the camera where they differ most.
-    """
-
-    reason: str
-    difference95_m: float = np.nan
-    expected95_m: float = np.nan
-    sigmas: float = np.nan
-    difference95_px: float = np.nan
-
-    @property
-    def disagrees(self) -> bool:
-        """Whether the difference is beyond the stated error, and neither chance nor rounding."""
-        return (
-            self.difference95_m > self.expected95_m
-            and self.sigmas > _DISAGREES_SIGMAS
-            and self.difference95_px > _NEGLIGIBLE_PX
-        )
-
-
-def second_opinion(rig: Rig, other: Rig | str, points_world: NDArray[np.float64]) -> SecondOpinion:
+def second_opinion(
+    rig: Rig, other: Rig | str, points_world: NDArray[np.float64]
+) -> SecondOpinion | NoOpinion:
     """Return by how much another estimate of a rig differs from it.
 
     Parameters
@@ -78,7 +38,7 @@ def second_opinion(rig: Rig, other: Rig | str, points_world: NDArray[np.float64]
         Points of the working volume, metres.
     """
     if isinstance(other, str):
-        return SecondOpinion(other)
+        return NoOpinion(other)
     rig = rig.only([camera.name for camera in other.cameras])
     matrix = _covariance(other)
     gains, _ = point_gains(rig, points_world)
@@ -98,18 +58,17 @@ def second_opinion(rig: Rig, other: Rig | str, points_world: NDArray[np.float64]
         largest_px = max(largest_px, float(np.quantile(lengths_px, _SHARE)))
     placed = np.isfinite(gains).all(axis=(1, 2))
     if not placed.any():
-        return SecondOpinion("no two cameras see a common volume in which to compare")
+        return NoOpinion("no two cameras see a common volume in which to compare")
     gains, information, moment = gains[placed], information[placed], moment[placed]
     difference_m = np.linalg.solve(information, moment[..., None])[..., 0]
     covariance_m2 = gains @ matrix @ gains.transpose(0, 2, 1)
     whitened = np.linalg.solve(covariance_m2, difference_m[..., None])[..., 0]
     squares = np.einsum("ni,ni->n", difference_m, whitened)
     return SecondOpinion(
-        "",
-        float(np.quantile(np.linalg.norm(difference_m, axis=1), _SHARE)),
-        float(np.quantile(radius95(covariance_m2), _SHARE)),
-        float(np.sqrt(np.quantile(squares, _SHARE))),
-        largest_px,
+        difference95_m=float(np.quantile(np.linalg.norm(difference_m, axis=1), _SHARE)),
+        expected95_m=float(np.quantile(radius95(covariance_m2), _SHARE)),
+        sigmas=float(np.sqrt(np.quantile(squares, _SHARE))),
+        difference95_px=largest_px,
     )
 
 

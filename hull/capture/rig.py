@@ -7,6 +7,7 @@ from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.calib.calibrate import calibrate_rig
 from hybridve.calib.errors import CalibrationError
@@ -15,8 +16,8 @@ from hybridve.calib.formats.tracker import read_poses
 from hybridve.calib.image_io import FrameSource
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.judging.twins import find_twins, twins_text
+from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.placing.world import Mark
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import recording_of
 from hybridve.hull.capture.rig_check import (
@@ -31,13 +32,16 @@ from hybridve.hull.capture.session import RigFile, Session
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def calibrate_session(session: Session, progress: Progress | None = None) -> Calibration:
+def calibrate_session(
+    session: Session, progress: Progress | None = None, box_world: Box | None = None
+) -> Calibration:
     """Return a session's rig from its pictures of its boards, and what it was made from.
 
     What was found in the pictures is kept beside the session (rig/corners), so that they are
-    searched once.
+    searched once. `box_world` has two corners of the working volume, metres, if one is asked for.
 
     Raises
     ------
@@ -63,6 +67,7 @@ def calibrate_session(session: Session, progress: Progress | None = None) -> Cal
             for point in session.points
         ),
         sync=session.sync,
+        box_world=box_world,
     )
     tracks = {
         camera.name: read_poses(camera.extrinsics_poses)
@@ -85,7 +90,7 @@ def load_rig(session: Session, progress: Progress | None = None) -> Rig:
     """Return the session's rig: the one it names, or the one that was calibrated for it.
 
     Whichever it is, it was tested against the boards that the session's cameras saw, if they saw
-    any (`hybridve.hull.capture.rig_check`); its provenance says so, as "check".
+    any (`hybridve.hull.capture.rig_check`); its ``check`` says so.
 
     Parameters
     ----------
@@ -142,7 +147,8 @@ def take_elsewhere(session: Session, progress: Progress | None = None) -> Rig:
     label = session.rig_file.pattern
     rig = _import(session, session.rig_file, board_sizes(session))
     rig = examined(session, rig, label, progress)
-    if rig.provenance["check"]["verdict"] == "no board":
+    assert rig.check is not None
+    if rig.check.verdict == "no board":
         _log.warning(
             "%s: the rig %r is taken as it is: there is no board in the session to test it against",
             session.path,

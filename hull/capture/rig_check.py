@@ -15,29 +15,29 @@ import json
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import hybridve.calib
 from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.boards.named import make_board
 from hybridve.calib.errors import CalibrationError, HybridveError
 from hybridve.calib.formats.rigs import rig_to_dict
-from hybridve.calib.judging.check import NotTestableError, RigCheck, check_from_dict, check_rig
+from hybridve.calib.judging.check import NotTestableError, check_rig
+from hybridve.calib.plain import to_plain
+from hybridve.calib.record import CalibrationRecord
 from hybridve.calib.rig import Rig
 from hybridve.calib.seeing.corner_cache import CornerCache
-from hybridve.calib.seeing.observe import CameraInput, find_boards
+from hybridve.calib.seeing.inputs import CameraInput
+from hybridve.calib.seeing.observe import find_boards
+from hybridve.calib.verdict import RigCheck, RigTest, check_from_dict
 from hybridve.hull.capture.session import Session, SessionCamera
 
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
-
-#: What is known of a rig: it agrees, or was made from the session's own clips; the boards refute
-#: it; they leave something open; they could not be read; there are none; no test was wanted.
-Verdict = Literal["agrees", "made here", "wrong", "open", "not tested", "no board", "off"]
 
 #: Whoever is told nothing of progress is told once that a test is going on, after so long.
 _PATIENCE_S = 2.0
@@ -45,37 +45,8 @@ _PATIENCE_S = 2.0
 _REMEDY = 'or use it all the same with rig_check = "off"'
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RigTest:
-    """What is known of a rig's agreement with the session's boards.
-
-    Attributes
-    ----------
-    verdict : str
-        One of `Verdict`.
-    message : str
-        The same in one line.
-    check : RigCheck or None
-        All that was found; None where nothing was tested.
-    """
-
-    verdict: Verdict
-    message: str
-    check: RigCheck | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain JSON values, for a rig's provenance; no value is NaN or infinite."""
-        told = {} if self.check is None else json.loads(json.dumps(asdict(self.check)))
-        finite = {
-            key: value
-            for key, value in told.items()
-            if not isinstance(value, float) or abs(value) < float("inf")
-        }
-        return {**finite, "verdict": self.verdict, "message": self.message}
-
-
 def examined(session: Session, rig: Rig, label: str, progress: Progress | None = None) -> Rig:
-    """Return a rig with what the session's boards say of it in its provenance, as "check".
+    """Return a rig with what the session's boards say of it, as its ``check``.
 
     What a user should know is logged as a warning.
 
@@ -113,9 +84,7 @@ def examined(session: Session, rig: Rig, label: str, progress: Progress | None =
             place,
             ", ".join(found.check.untested),
         )
-    return Rig(
-        rig.cameras, {**rig.provenance, "check": found.to_dict()}, rig.covariance, rig.mounts
-    )
+    return replace(rig, check=found)
 
 
 def ask_boards(session: Session, rig: Rig, progress: Progress | None = None) -> RigTest:
@@ -153,7 +122,14 @@ def ask_boards(session: Session, rig: Rig, progress: Progress | None = None) -> 
 
 
 def _made_here(rig: Rig) -> RigTest:
-    if rig.provenance.get("labelling", {}).get("is_weak", False):
+    if not isinstance(rig.provenance, CalibrationRecord):
+        return RigTest(
+            "open",
+            "it was calibrated from the session's own board, but what was doubted then is told no "
+            "more",
+        )
+    labelling = rig.provenance.labelling
+    if labelling is not None and labelling.is_weak:
         return RigTest(
             "open",
             "it was calibrated from the session's own board, which looks the same turned, and "
@@ -223,7 +199,7 @@ def _check(session: Session, rig: Rig, names: Sequence[str], progress: Progress 
     check = check_rig(rig, session_boards(session), observations)
     if progress is not None:
         progress("testing the rig", 1, 1)
-    kept.keep(question, (asdict(check), None))
+    kept.keep(question, (to_plain(check), None))
     kept.save()
     return check
 
@@ -312,7 +288,7 @@ def _digest_of_code() -> str:
     """Return a digest of all that decides how a rig is tested: another version may differ."""
     digest = hashlib.sha256()
     for folder in hybridve.calib.__path__:
-        for path in sorted(Path(folder).glob("*.py")):
+        for path in sorted(Path(folder).rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 

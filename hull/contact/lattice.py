@@ -272,8 +272,8 @@ def _judge(
             side[i] = _OUTSIDE if largest_m > 0 else _INSIDE
         else:
             side[i] = _ACROSS
-        apart_m = np.sqrt(above) - np.sqrt(max(mean - diagonal, 0.0))
-        is_fine[i] = side[i] != _ACROSS and apart_m <= fine_m
+        gap_m = np.sqrt(above) - np.sqrt(max(mean - diagonal, 0.0))
+        is_fine[i] = side[i] != _ACROSS and gap_m <= fine_m
     return side, is_fine
 
 

@@ -65,13 +65,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from hybridve.calib.pose import Pose
+from hybridve.calib.record import CalibrationRecord
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.covariance import undistorted_covariance
 from hybridve.hull.contact.bulge import real_upper
@@ -231,10 +232,9 @@ class OutlineErrors:
 
 def outline_errors(
     names: Sequence[str],
-    provenance: Mapping[str, Any],
+    rig: Rig | None,
     mask_shift_px: Sequence[float | None],
     settings: DoubtSettings | None = None,
-    rig: Rig | None = None,
 ) -> OutlineErrors:
     """Return how far outlines may be off, as far as the rig tells.
 
@@ -242,20 +242,17 @@ def outline_errors(
     ----------
     names : sequence of str
         The cameras, C of them.
-    provenance : mapping
-        Where the rig comes from (`hybridve.calib.rig.Rig`). How far the corners of the board were
-        missed is taken from ``cameras.NAME.{intrinsics,extrinsics}.rms_px``, the larger one, or
-        from ``check.rms_px.NAME`` of a rig made elsewhere; these are lengths, and an outline cares
-        for one axis only.
+    rig : Rig or None
+        The rig. Its covariance is used if it has one; else how far the corners of the board were
+        missed, when it was calibrated or by the session's test of it, whichever is more. These are
+        lengths, and an outline cares for one axis only. None: nothing is told.
     mask_shift_px : sequence of C floats or None
         Bounds of `hybridve.calib.lens_bound`; None where there is none, which counts as a pixel.
     settings : DoubtSettings, optional
         What is assumed where the rig does not tell.
-    rig : Rig, optional
-        The rig; its covariance is used if it has one.
     """
     settings = settings or DoubtSettings()
-    missed_px = np.array([_missed_px(provenance, name) for name in names])
+    missed_px = np.array([_missed_px(rig, name) for name in names])
     is_measured = np.isfinite(missed_px)
     shift_px = np.array([1.0 if shift is None else shift for shift in mask_shift_px], np.float64)
     return OutlineErrors(
@@ -267,12 +264,16 @@ def outline_errors(
     )
 
 
-def _missed_px(provenance: Mapping[str, Any], name: str) -> float:
+def _missed_px(rig: Rig | None, name: str) -> float:
     """Return the rms length by which a camera's corners were missed; NaN where nobody knows."""
-    of_camera = provenance.get("cameras", {}).get(name, {})
-    told = [of_camera.get(kind, {}).get("rms_px") for kind in ("intrinsics", "extrinsics")]
-    told.append(provenance.get("check", {}).get("rms_px", {}).get(name))
-    return max((float(value) for value in told if value is not None), default=np.nan)
+    told: list[float | None] = []
+    if rig is not None and isinstance(rig.provenance, CalibrationRecord):
+        camera = rig.provenance.cameras.get(name)
+        if camera is not None:
+            told += [camera.intrinsics.rms_px, camera.extrinsics.rms_px]
+    if rig is not None and rig.check is not None and rig.check.check is not None:
+        told.append(rig.check.check.rms_px.get(name))
+    return max((missed_px for missed_px in told if missed_px is not None), default=np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

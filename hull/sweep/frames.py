@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
-from hybridve.hull.capture.recording import FrameRange, silhouettes_of
+from hybridve.hull.capture.recording import FrameRange
+from hybridve.hull.chain import Chain, hulls
 from hybridve.hull.contact.detect import Body
-from hybridve.hull.evaluate import Chain, views_at
 from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
@@ -84,21 +84,13 @@ def read_hulls(
     """
     frames: list[HullFrame] = []
     n_bytes = 0
-    found = silhouettes_of(
-        chain.session,
-        chain.silhouettes,
-        chain.settings.frames,
-        tracks=chain.tracks,
-        undistortions=chain.undistortions,
-        progress=progress,
-    )
-    with closing(found) as silhouettes:
-        for frame in silhouettes:
+    with closing(hulls(chain, progress=progress)) as found:
+        for frame in found:
             advance()
-            if frame.masks is None:
+            hull = frame.hull
+            if hull is None:
                 _log.warning("frame %d is left out: %s", frame.index, frame.reason)
                 continue
-            hull = make_hull(views_at(chain, frame.index), frame.masks)
             n_bytes += hull.masks_flat.nbytes + hull.integrals_flat.nbytes
             if n_bytes > _MOST_BYTES:
                 raise SessionError(

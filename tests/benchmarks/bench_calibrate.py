@@ -16,7 +16,8 @@ from hybridve.calib.boards.target import Chessboard, detect_corners
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.image_io import open_source
 from hybridve.calib.pose import compose
-from hybridve.calib.seeing.observe import CameraInput, observe_boards
+from hybridve.calib.seeing.inputs import CameraInput
+from hybridve.calib.seeing.observe import observe_boards
 
 HORSEMAN = Chessboard(8, 6, 0.115)
 
@@ -54,7 +55,7 @@ def bench_horseman_search(benchmark: Any, horseman_inputs: list[CameraInput]) ->
 def bench_horseman_solve(benchmark: Any, horseman_seen: list[Observations]) -> None:
     """From corners to the rig, the scene around the symmetric board included."""
     rig = benchmark.pedantic(solve_rig, ([HORSEMAN], horseman_seen), rounds=3).rig
-    benchmark.extra_info["rms_px"] = rig.provenance["rms_px"]
+    benchmark.extra_info["rms_px"] = rig.provenance.rms_px
 
 
 @pytest.mark.parametrize(("n_cameras", "n_stills"), [(4, 50), (16, 50)])

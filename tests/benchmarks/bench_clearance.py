@@ -28,8 +28,8 @@ from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import calibrate_session
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.chain import rig_views
 from hybridve.hull.contact.clearance import ClearanceMeter
-from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
 

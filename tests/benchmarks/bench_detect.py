@@ -19,10 +19,11 @@ from hybridve.hull.cad.scene import SceneObject, load_scene
 from hybridve.hull.capture.recording import FrameRange
 from hybridve.hull.capture.rig import calibrate_session
 from hybridve.hull.capture.session import Session, load_session
+from hybridve.hull.chain import Chain, EvaluateSettings, rig_views
 from hybridve.hull.contact.detect import Body, make_body
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.uncertainty import DoubtSettings
-from hybridve.hull.evaluate import Chain, EvaluateSettings, evaluate, rig_views
+from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.choose import open_engine
 
 PROJECT = Path(__file__).parent.parent.parent

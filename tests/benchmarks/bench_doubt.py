@@ -24,12 +24,12 @@ from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import calibrate_session
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.chain import rig_views
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.components import FAR_M, pixel_rays
 from hybridve.hull.contact.detect import Contact, detect_contacts, make_body
 from hybridve.hull.contact.finding import agreed
 from hybridve.hull.contact.uncertainty import Doubt, Doubter, DoubtSettings, outline_errors
-from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query import walk_reference
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Hull, make_hull
@@ -75,7 +75,7 @@ def bench_doubt(benchmark: Any, hulls: list[Hull], near_m: float) -> None:
             seen.append((hull, list(map(agreed, contacts, clearances))))
     settings = DoubtSettings(near_m=near_m)
     names = hulls[0].views.names
-    doubter = Doubter(outline_errors(names, {}, [0.0] * len(names), settings), settings)
+    doubter = Doubter(outline_errors(names, None, [0.0] * len(names), settings), settings)
     queue = itertools.cycle(seen)
 
     def doubt_all() -> list[Doubt]:

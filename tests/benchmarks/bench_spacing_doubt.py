@@ -40,10 +40,10 @@ from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import undistort_mask
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.session import Session, load_session
+from hybridve.hull.chain import rig_views
 from hybridve.hull.contact.spacing import Move, blocked_shifts, free_of, union
 from hybridve.hull.contact.spacing_doubt import unsure_shifts
 from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
-from hybridve.hull.evaluate import rig_views
 from hybridve.hull.query.silhouettes import make_hull
 from hybridve.hull.spacing import Layout
 from hybridve.hull.synth.render import make_view, true_silhouette
@@ -144,7 +144,7 @@ class Payload:
         views, lenses = rig_views(self._session, rig)
         shift_px = [lens_shift_px(*pair) for pair in zip(rig.cameras, lenses, strict=True)]
         doubter = Doubter(
-            outline_errors(views.names, {}, shift_px, self._settings, rig), self._settings
+            outline_errors(views.names, rig, shift_px, self._settings), self._settings
         )
         blocked, unsure, std_m = [], [], []
         for inside_px in self._inside_px:

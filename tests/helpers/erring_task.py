@@ -137,7 +137,7 @@ class ErringTask:
         rig = self.believed(rng)
         settings = DoubtSettings(segmentation_px=self.segmentation_px)
         names = tuple(camera.name for camera in rig.cameras)
-        doubter = Doubter(outline_errors(names, {}, [0.0] * len(names), settings, rig), settings)
+        doubter = Doubter(outline_errors(names, rig, [0.0] * len(names), settings), settings)
         blocked, unsure, std_m = [], [], 0.0
         for frame in range(len(self.centers_world)):
             hull = self.hull(rng, rig, frame)

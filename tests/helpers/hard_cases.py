@@ -20,7 +20,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import MAX_HALF_ANGLE_DEG, cam_from_img, img_from_cam
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import undistort_mask
-from hybridve.hull.evaluate import rig_views
+from hybridve.hull.chain import rig_views
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull, make_views
 

@@ -87,7 +87,7 @@ def test_a_doubt_does_not_depend_on_what_was_doubted_before(
 ) -> None:
     hull, _ = hull_beside_box(seed, n_cameras, n_balls)
     free = FREE
-    doubter = Doubter(outline_errors(hull.views.names, {}, [0.0] * len(hull.views)))
+    doubter = Doubter(outline_errors(hull.views.names, None, [0.0] * len(hull.views)))
     fresh = ClearanceMeter(
         box_vertices(np.zeros(3), BOX_HALF_M), BOX_FACES, is_closed=True, tolerance_m=5e-4
     )
@@ -114,7 +114,8 @@ def test_whatever_the_silhouettes_a_doubt_agrees_with_itself(
     clearance = meter().measure(hull)
     contact = FREE
     doubter = Doubter(
-        outline_errors(views.names, {}, [0.0] * n_cameras), DoubtSettings(cell_m=0.2, near_m=np.inf)
+        outline_errors(views.names, None, [0.0] * n_cameras),
+        DoubtSettings(cell_m=0.2, near_m=np.inf),
     )
 
     found = doubter.frame(hull).doubt(meter(), contact, clearance)

@@ -27,6 +27,7 @@ from hybridve.calib.formats.rigs import (
 )
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import compose, rotation_about_axes
+from hybridve.calib.record import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 #: Text with 17 digits gives a projection back to this, in pixels.
@@ -155,7 +156,9 @@ def test_mirrored_pictures_are_refused_and_reversed_signs_are_not(
 
 @given(camera=cameras(), note=st.text(), number=st.floats(allow_nan=False, allow_infinity=False))
 def test_a_rig_is_read_back_to_the_bit(camera: Camera, note: str, number: float) -> None:
-    rig = Rig((camera,), {"note": note, "number": number, "list": [None, True, {"a": 1}]})
+    rig = Rig(
+        (camera,), MadeElsewhere({"note": note, "number": number, "list": [None, True, {"a": 1}]})
+    )
 
     with tempfile.TemporaryDirectory() as folder:
         write_rig(Path(folder) / "rig.json", rig)
@@ -283,7 +286,7 @@ def test_cameras_are_taken_from_a_rig_with_their_share_of_the_covariance(
     labels = tuple(f"{c.name} {p}" for c in cameras for p in range(6 + len(c.params)))
     root = np.random.default_rng(n_cameras).normal(size=(len(labels), len(labels)))
     mounts = {camera.name: Mount(np.eye(3, 4), np.eye(3, 4)) for camera in cameras[::2]}
-    rig = Rig(cameras, {}, RigCovariance(labels, root @ root.T), mounts)
+    rig = Rig(cameras, MadeElsewhere(), RigCovariance(labels, root @ root.T), mounts)
     names = data.draw(st.permutations([c.name for c in cameras]))
     names = names[: data.draw(st.integers(1, n_cameras))]
 

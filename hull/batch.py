@@ -1,0 +1,205 @@
+"""Recordings against layouts, into reports: one, or every session with every scene."""
+
+import json
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from hybridve.calib.errors import HybridveError, ReportError
+from hybridve.hull.about import (
+    about_objects,
+    about_rig,
+    computed_parts,
+    local_origin_m,
+    resolved_settings,
+    stored_meshes,
+)
+from hybridve.hull.cad.scene import Scene, load_scene
+from hybridve.hull.capture.session import Session, load_session
+from hybridve.hull.chain import Chain, EvaluateSettings, count_frames, make_chain
+from hybridve.hull.evaluate import evaluate
+from hybridve.hull.query.choose import open_engine
+from hybridve.hull.query.engine import EngineName
+from hybridve.hull.report.compare import Pair, report_name
+from hybridve.hull.report.machine import machine_text, software_versions
+from hybridve.hull.report.read import read_report
+from hybridve.hull.report.schema import ReportHeader
+from hybridve.hull.report.summarize import summarize
+from hybridve.hull.report.write import ReportWriter, refuse_existing
+from hybridve.hull.watcher import Watcher
+
+_Loaded = TypeVar("_Loaded")
+
+
+@dataclass(frozen=True, slots=True)
+class DetectSettings:
+    """What is the same for all sessions and layouts.
+
+    Attributes
+    ----------
+    evaluation : EvaluateSettings
+        How each recording is evaluated.
+    engine : str
+        What answers the volume query; "auto" for the fastest of this machine.
+    points : "sample" or "all"
+        Whether collision points are spelt out for programs that cannot make them from runs.
+    resume : bool
+        Whether reports that were cut off are taken up.
+    overwrite : bool
+        Whether what stands under a report's name is replaced.
+    command : str
+        What was called, for the report.
+    """
+
+    evaluation: EvaluateSettings
+    engine: EngineName = "auto"
+    points: Literal["sample", "all"] = "sample"
+    resume: bool = False
+    overwrite: bool = False
+    command: str = ""
+
+
+def detect_one(
+    session: Path, scene: Path, output: Path, settings: DetectSettings, watcher: Watcher
+) -> None:
+    """Evaluate a recording against a layout into a report."""
+    refuse_existing(output, overwrite=settings.overwrite)
+    chain = make_chain(load_session(session), load_scene(scene), settings.evaluation, watcher.stage)
+    write_report(chain, output, settings, watcher)
+
+
+def write_report(chain: Chain, output: Path, settings: DetectSettings, watcher: Watcher) -> None:
+    """Evaluate a chain into a report; where one was cut off and is taken up, what is missing."""
+    with open_engine(settings.engine) as engine:
+        header = ReportHeader(
+            command=settings.command,
+            objects=about_objects(chain),
+            settings=resolved_settings(chain),
+            rig=about_rig(chain),
+            engine=engine.name,
+            renderer=engine.renderer,
+            parts=computed_parts(chain.settings),
+            cameras=chain.views.names,
+            versions=software_versions(),
+            machine=machine_text(),
+            local_origin_m=local_origin_m(chain),
+            meshes=stored_meshes(chain),
+            points=settings.points,
+        )
+        with ReportWriter(
+            output, header, resume=settings.resume, overwrite=settings.overwrite
+        ) as writer:
+            evaluation = evaluate(
+                chain,
+                engine,
+                skip=writer.n_done,
+                write_s=writer.take_write_s,
+                progress=watcher.stage,
+            )
+            with (
+                closing(evaluation) as results,
+                watcher.steps("detect", count_frames(chain), done=writer.n_done) as advance,
+            ):
+                for result in results:
+                    writer.append(result)
+                    advance()
+            watcher.say(f"writing {output}")
+            writer.finish()
+
+
+def detect_every(
+    sessions: Mapping[str, Path],
+    scenes: Mapping[str, Path],
+    folder: Path,
+    table: Path,
+    settings: DetectSettings,
+    watcher: Watcher,
+) -> list[Pair]:
+    """Test every session against every layout, a report each; those that fail are told and left.
+
+    Parameters
+    ----------
+    sessions, scenes : mapping of str to Path
+        Which, by the names that their reports take.
+    folder : Path
+        Where the reports go; it is made if it is not there.
+    table : Path
+        What the caller writes beside them; it is not replaced unless that is allowed.
+    settings : DetectSettings
+        How.
+    watcher : Watcher
+        Told what goes on, and what failed.
+
+    Raises
+    ------
+    ReportError
+        If something stands where a report is to be, before anything is done.
+    """
+    _make_folder(folder)
+    if not settings.resume:
+        for path in [
+            *(folder / report_name(one, other) for one in sessions for other in scenes),
+            table,
+        ]:
+            refuse_existing(path, overwrite=settings.overwrite)
+    loaded = {name: _load(load_session, path, watcher) for name, path in sessions.items()}
+    layouts = {name: _load(load_scene, path, watcher) for name, path in scenes.items()}
+    pairs: list[Pair] = []
+    for name, session in loaded.items():
+        for layout, scene in layouts.items():
+            if isinstance(session, HybridveError) or isinstance(scene, HybridveError):
+                lost = session if isinstance(session, HybridveError) else scene
+                pairs.append(Pair(name, layout, None, str(lost)))
+                continue
+            count = len(sessions) * len(scenes)
+            watcher.say(f"{name}, {layout} ({len(pairs) + 1} of {count})")
+            path = folder / report_name(name, layout)
+            try:
+                found = _made_or_finished(session, scene, path, settings, watcher)
+                pairs.append(Pair(name, layout, found))
+            except HybridveError as error:
+                watcher.warn(f"error: {name}, {layout}: {error}")
+                pairs.append(Pair(name, layout, None, str(error)))
+    return pairs
+
+
+def _load(
+    loader: Callable[[Path], _Loaded], path: Path, watcher: Watcher
+) -> _Loaded | HybridveError:
+    """Return what a file holds, or why it cannot be read."""
+    try:
+        return loader(path)
+    except HybridveError as error:
+        watcher.warn(f"error: {error}")
+        return error
+
+
+def _make_folder(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise ReportError(
+            f"{folder}: is a file; several sessions or layouts need a folder for their reports"
+        )
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise ReportError(f"{folder}: cannot be made: {error.strerror}") from error
+
+
+def _made_or_finished(
+    session: Session, scene: Scene, path: Path, settings: DetectSettings, watcher: Watcher
+) -> dict[str, Any]:
+    """Return the summary of one report; one that is finished is not made again when resuming."""
+    chain = make_chain(session, scene, settings.evaluation, watcher.stage)
+    if settings.resume and path.exists() and not settings.overwrite:
+        found = read_report(path)
+        wanted = json.loads(json.dumps([resolved_settings(chain), about_rig(chain)]))
+        if [found.settings, found.rig] != wanted:
+            raise ReportError(
+                f"{path}: was finished with other settings, another recording or another scene; "
+                "give the same again, or start anew with --overwrite"
+            )
+        return summarize(found)
+    write_report(chain, path, settings, watcher)
+    return summarize(read_report(path))
