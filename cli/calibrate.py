@@ -218,7 +218,7 @@ def _calibrate(
     if session.rig_file is not None:
         rig = take_elsewhere(session, terminal.stage)
     else:
-        calibration = calibrate_session(session, terminal.stage)
+        calibration = calibrate_session(session, terminal.stage, box_world)
         rig = calibration.rig
         volume = working_volume(rig, box_world)
         seen = {
