@@ -1,14 +1,15 @@
 # make demo    the whole job on a generated session
 # make test    everything that must hold: style, types, import contracts, tests
+# make quick   a minute of the tests: of each one that is quick the first case
 # make soak    the property tests with new examples: RUNS=10 times, SEED=1 and up, TESTS=some files
-# make bench   the benchmarks, with the numbers of the README
+# make bench   the benchmarks at full size, into tests/benchmarks/results.json; ONLY="bench_query" some
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
 # make hard-cases   the table of hard cases in tests/README.md: what each column makes of each row
 # make lock    renew requirements.lock after a change of pyproject.toml
 
 BIN := .venv/bin
 
-.PHONY: demo test check pytest soak bench theory hard-cases lock setup clean
+.PHONY: demo test check pytest quick soak bench theory hard-cases lock setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -26,14 +27,16 @@ check: setup
 pytest: setup
 	$(BIN)/pytest -n auto --dist loadfile --benchmark-disable
 
+quick: setup
+	$(BIN)/pytest -q -n auto --dist loadfile --benchmark-disable --quick
+
 # New examples, a seed a round: RUNS rounds (1), seeds from SEED up (drawn), of the tests in TESTS
 # (all that draw). The first round that is red ends it, and says how to repeat just that round.
 soak: setup
 	@RUNS="$(RUNS)" SEED="$(SEED)" TESTS="$(TESTS)" bash .ci/soak
 
 bench: setup
-	$(BIN)/pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' \
-		--benchmark-columns=median,iqr,min,rounds --benchmark-sort=fullname
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/results.py $(ONLY)
 
 theory: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/bench_theory.py --processes 2 \

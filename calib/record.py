@@ -9,14 +9,12 @@ adds a field adds it here, and where it is a doubt to `CalibrationRecord.doubts`
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-from hybridve.calib.plain import Told, read_strictly, to_plain
+from hybridve.calib.plain import Told
 
-#: By these a record is known to be of this program: either suffices.
 METHOD: Final = "joint bundle adjustment of lenses, poses and boards"
-_PROGRAM = "hybridve"
 
 #: Decided by what cameras recognise around a still board that looks the same when turned.
 BY_SCENE = "matches of the scene"
@@ -560,50 +558,3 @@ class CalibrationRecord(Told):
         """Return the record with cameras called anew; those without a new name keep theirs."""
         cameras = {names.get(name, name): told for name, told in self.cameras.items()}
         return replace(self, cameras=cameras)
-
-
-@dataclass(frozen=True, slots=True)
-class MadeElsewhere:
-    """A rig that this program did not calibrate: what was decided or doubted is not known.
-
-    Attributes
-    ----------
-    told : dict
-        What its file says of where it comes from, as plain JSON values; nobody relies on it.
-    """
-
-    told: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def format(self) -> str:
-        """The format that it was read from, as far as known: a rig.json unless told otherwise."""
-        return str(self.told.get("format", "json"))
-
-
-Provenance = CalibrationRecord | MadeElsewhere
-
-
-# --- As JSON ----------------------------------------------------------------------------------
-
-
-def provenance_to_plain(provenance: Provenance) -> dict[str, Any]:
-    """Return what stands in a rig.json; what a foreign rig told is passed on as it was."""
-    if isinstance(provenance, MadeElsewhere):
-        return provenance.told
-    plain: dict[str, Any] = to_plain(provenance)
-    return plain
-
-
-def provenance_from_plain(told: Mapping[str, Any]) -> Provenance:
-    """Return what stands in a rig.json, typed.
-
-    Raises
-    ------
-    CalibrationError
-        If it is a record of this program, but not complete.
-    """
-    software = told.get("software")
-    is_ours = isinstance(software, Mapping) and _PROGRAM in software
-    if not is_ours and told.get("method") != METHOD:
-        return MadeElsewhere(dict(told))
-    return read_strictly(CalibrationRecord, told, "provenance")

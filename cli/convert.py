@@ -100,7 +100,8 @@ def convert(
       hybridve convert rig/rig.json --to kalibr -o camchain.yaml
       hybridve convert '{camera}/config.xml' --from-unit mm --to colmap -o sparse
     """
-    from hybridve.calib.formats.rigs import export_rig, output_files, read_any_rig
+    from hybridve.calib.formats.rig_export import export_rig, output_files
+    from hybridve.calib.formats.rigs import read_any_rig
     from hybridve.hull.report.write import refuse_existing
 
     found = read_any_rig(

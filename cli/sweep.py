@@ -150,8 +150,9 @@ def sweep(
         write_sweep,
     )
     from hybridve.hull.report.write import refuse_existing
-    from hybridve.hull.sweep.experiment import make_rows, run_sweep, samples_asked
+    from hybridve.hull.sweep.experiment import run_sweep
     from hybridve.hull.sweep.frames import read_hulls, spread_frames
+    from hybridve.hull.sweep.judgement import make_rows, samples_asked
     from hybridve.hull.sweep.picture import write_picture_of
     from hybridve.hull.sweep.room import EngineRoom
     from hybridve.hull.view.chart import SUFFIXES

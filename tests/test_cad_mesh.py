@@ -867,6 +867,7 @@ def test_binary_stl_is_what_open3d_reads_to_the_bit(recordings: Path) -> None:
         np.testing.assert_array_equal(corners(path), triangles, strict=True)
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 @pytest.mark.parametrize(
     ("step", "stl", "stl_unit_m", "volume"),

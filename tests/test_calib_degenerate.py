@@ -21,7 +21,7 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.judging.certificate import Certificate, SeenPoints, certify, working_volume
 from hybridve.calib.lens import img_from_cam
@@ -609,6 +609,21 @@ def test_boards_back_to_back_link_cameras_that_face_each_other() -> None:
     assert_honest(calibration, certificate, true)
 
 
+def test_the_order_of_boards_and_cameras_changes_no_bit() -> None:
+    boards, seen, _, _ = facing()
+    swapped = [
+        replace(one, sightings=tuple(replace(s, board=1 - s.board) for s in one.sightings[::-1]))
+        for one in seen[::-1]
+    ]
+
+    found, again = solve_rig(boards, seen), solve_rig(boards[::-1], swapped)
+
+    assert again.record == found.record
+    for camera in found.rig.cameras:
+        np.testing.assert_array_equal(again.rig[camera.name].params, camera.params)
+        np.testing.assert_array_equal(again.rig[camera.name].cam_from_world, camera.cam_from_world)
+
+
 def test_boards_back_to_back_that_are_no_body_link_nothing_and_that_is_said() -> None:
     boards, seen, _, _ = facing()
 
@@ -657,12 +672,14 @@ def test_a_clock_that_is_late_contradicts_the_others_and_the_way_out_is_said() -
     )
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_a_little_late_is_doubted_and_the_way_out_is_said() -> None:
     _, certificate = calibrated([CARRIED], late_by(0.6))
 
     assert_doubted("'cam2' does not agree with the others|sync = \"estimate\"", certificate)
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_late_is_found_out_where_it_is_asked_for() -> None:
     settings = CalibrationSettings(sync="estimate")
 

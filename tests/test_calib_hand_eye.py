@@ -177,6 +177,7 @@ def test_the_order_of_pictures_does_not_matter() -> None:
     assert about == again
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise",
     [{"noise_px": 0.3}, {"tracker_rad": 0.003, "tracker_m": 0.002, "noise_px": 0.1}],

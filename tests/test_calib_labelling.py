@@ -124,6 +124,7 @@ def test_the_pose_behind_a_mirrored_picture_is_the_cameras_in_some_look(name: st
     assert np.linalg.det(pose[:, :3]) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["7x6", "6x6"])
 def test_a_mirrored_picture_is_named(name: str) -> None:
     told = refusal(name, (False, True, False))
@@ -183,6 +184,7 @@ def test_of_two_cameras_either_may_be_mirrored() -> None:
     assert told.startswith("the picture of camera 'cam1' or of 'cam2' seems to be mirrored: ")
 
 
+@pytest.mark.slow
 def test_of_two_kinds_of_pictures_the_fewer_are_the_suspects() -> None:
     told = refusal("7x6", (True, False, True, True, False))
 

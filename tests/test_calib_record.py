@@ -15,8 +15,9 @@ from helpers.records import make_camera_record, make_check, make_opinion, make_r
 from hybridve.calib import record as record_module
 from hybridve.calib import verdict as verdict_module
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import read_rig, rig_to_dict, write_rig
+from hybridve.calib.formats.rig_json import read_rig, rig_to_dict, write_rig
 from hybridve.calib.plain import Told, to_plain
+from hybridve.calib.provenance import MadeElsewhere, provenance_from_plain
 from hybridve.calib.record import (
     BY_SCENE,
     Adjustment,
@@ -25,13 +26,11 @@ from hybridve.calib.record import (
     ClocksRecord,
     Labelling,
     LensChoice,
-    MadeElsewhere,
     MountRecord,
     Noise,
     NoOpinion,
     Outlier,
     WorldRecord,
-    provenance_from_plain,
 )
 from hybridve.calib.rig import Rig
 from hybridve.calib.verdict import Moved, RigTest, Turned

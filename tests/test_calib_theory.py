@@ -54,6 +54,7 @@ def mean_of_squares(matrices: list[NDArray[np.float64]]) -> tuple[float, float]:
     return sum(squares for squares, _ in found) / count, 4.0 * np.sqrt(2.0 / count)
 
 
+@pytest.mark.slow
 def test_errors_are_as_small_as_theory_allows() -> None:
     """An estimate a quarter worse than the Cramer-Rao bound would have the mean 1.56, not 1."""
     bound = least_covariance(SCENE, NOISE_PX)

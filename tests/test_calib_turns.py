@@ -83,6 +83,7 @@ def test_a_second_board_tells_whether_it_is_symmetric_or_not(second: Chessboard)
     assert (state(right), state(wrong)) == ("agrees", "refuted")
 
 
+@pytest.mark.slow
 def test_the_distance_that_is_told_is_that_of_the_two_places() -> None:
     cameras, seen = around(QUARTERS, 1, 3, True)
 

@@ -17,6 +17,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import project_points
 from hybridve.calib.placing.marks import Mark, triangulate
+from hybridve.calib.placing.moments import Body, Moment, PoseKey
 from hybridve.calib.placing.world import (
     Placed,
     SeenBoards,
@@ -77,8 +78,11 @@ def lying(
         for pose, cameras in enumerate(seeing)
         for camera in cameras
     ]
-    names = [(instant, "board") for instant in instants]
-    return SeenBoards([BOARD], [np.eye(3, 4)], rig_from_boards, names, views)
+    moments = [
+        Moment.of_clip(one) if isinstance(one, int) else Moment.of_still(0, one) for one in instants
+    ]
+    keys = [PoseKey(moment, Body(False, "board")) for moment in moments]
+    return SeenBoards([BOARD], [np.eye(3, 4)], rig_from_boards, keys, views)
 
 
 def assert_same(placed: Placed, world_from_rig: Pose) -> None:

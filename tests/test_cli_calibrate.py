@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Detection, Effort
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.pose import compose
 from hybridve.calib.record import BY_SCENE, Labelling
@@ -133,6 +133,7 @@ def calibrated(recorded: Path) -> tuple[Path, dict[str, Any], str]:
     return out, json.loads(ran.stdout), ran.stderr
 
 
+@pytest.mark.slow
 def test_the_rig_is_where_the_cameras_stood(calibrated: tuple[Path, dict[str, Any], str]) -> None:
     rig = read_rig(calibrated[0] / "rig.json")
 
@@ -143,6 +144,7 @@ def test_the_rig_is_where_the_cameras_stood(calibrated: tuple[Path, dict[str, An
     assert rig.covariance is not None
 
 
+@pytest.mark.slow
 def test_the_certificate_is_the_same_in_all_forms(
     calibrated: tuple[Path, dict[str, Any], str],
 ) -> None:
@@ -160,6 +162,7 @@ def test_the_certificate_is_the_same_in_all_forms(
     assert [one["name"] for one in told["cameras"]] == ["cam1", "cam2", "cam3"]
 
 
+@pytest.mark.slow
 def test_nothing_half_written_stands_beside_the_rig(
     calibrated: tuple[Path, dict[str, Any], str],
 ) -> None:
@@ -168,6 +171,7 @@ def test_nothing_half_written_stands_beside_the_rig(
     assert names == {"rig.json", "certificate.json", "certificate.html", "colmap", "corners"}
 
 
+@pytest.mark.slow
 def test_a_second_run_reads_no_picture_and_says_the_same(
     run: Run,
     capsys: Captured,
@@ -189,6 +193,7 @@ def test_a_second_run_reads_no_picture_and_says_the_same(
     assert not (out / "certificate.html").exists()
 
 
+@pytest.mark.slow
 def test_what_is_unusual_about_boards_is_told_once(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -207,6 +212,7 @@ def test_what_is_unusual_about_boards_is_told_once(
     assert all(line.strip().endswith(" views: inverted") for line in lines)
 
 
+@pytest.mark.slow
 def test_a_rig_that_exists_is_kept_unless_told(
     run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
 ) -> None:
@@ -223,6 +229,7 @@ def test_a_rig_that_exists_is_kept_unless_told(
     )
 
 
+@pytest.mark.slow
 def test_the_text_begins_with_the_verdict(
     run: Run,
     capsys: Captured,
@@ -241,6 +248,7 @@ def test_the_text_begins_with_the_verdict(
     assert lines[1] == f"{tmp_path / 'rig' / 'rig.json'}: 3 cameras"
 
 
+@pytest.mark.slow
 def test_a_rig_that_is_not_good_enough_has_a_status_of_its_own(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -317,6 +325,7 @@ def test_a_rig_that_is_doubted_passes_no_gate(
     assert calibrated[1]["certificate"]["doubts"] == []
 
 
+@pytest.mark.slow
 def test_the_volume_is_the_one_that_is_asked_for(
     run: Run,
     capsys: Captured,
@@ -338,6 +347,7 @@ def test_the_volume_is_the_one_that_is_asked_for(
     assert high[2] == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -357,6 +367,7 @@ def test_wrong_usage_is_status_2(
 # --- A rig that is checked ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_rig_that_still_fits_passes_its_check(
     run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
 ) -> None:
@@ -369,6 +380,7 @@ def test_a_rig_that_still_fits_passes_its_check(
     assert told["scale"] == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_bumped_is_named_with_status_4(
     run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
 ) -> None:
@@ -404,6 +416,7 @@ def expect_no_rig(run: Run, capsys: Captured, message: str, path: Path, output: 
     assert not list(output.glob("certificate*"))
 
 
+@pytest.mark.slow
 def test_one_camera_is_calibrated_and_passes_no_gate(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -421,6 +434,7 @@ def test_one_camera_is_calibrated_and_passes_no_gate(
     assert off_m < PLACED_M
 
 
+@pytest.mark.slow
 def test_a_camera_upside_down_is_placed_as_it_hangs(
     run: Run, recorded: Path, tmp_path: Path
 ) -> None:
@@ -443,6 +457,7 @@ def test_a_camera_upside_down_is_placed_as_it_hangs(
     )
 
 
+@pytest.mark.slow
 def test_exchanged_clips_are_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -453,6 +468,7 @@ def test_exchanged_clips_are_one_line(
     )
 
 
+@pytest.mark.slow
 def test_a_recording_listed_twice_is_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -463,6 +479,7 @@ def test_a_recording_listed_twice_is_one_line(
     expect_no_rig(run, capsys, "'cam1' and 'cam3' show the same pictures", twice, tmp_path / "rig")
 
 
+@pytest.mark.slow
 def test_mirrored_pictures_are_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -475,6 +492,7 @@ def test_mirrored_pictures_are_one_line(
     expect_no_rig(run, capsys, "seems to be mirrored", mirrored, tmp_path / "rig")
 
 
+@pytest.mark.slow
 def test_pictures_without_the_board_are_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:

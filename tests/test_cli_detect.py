@@ -83,6 +83,7 @@ def test_every_frame_in_which_the_ball_meets_the_surface_collides(
     assert (far.certificate == "free").all()
 
 
+@pytest.mark.slow
 def test_the_engines_write_the_same_points(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -207,6 +208,7 @@ def test_a_frame_that_could_not_be_read_is_no_kept_distance(
     assert "cam2" in rows.why[1]
 
 
+@pytest.mark.slow
 def test_something_inside_or_too_near_is_a_clash_too(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -373,6 +375,7 @@ def test_summary_counts_what_the_report_holds(
     assert "1 clash, 1 kept" in text
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
     tmp_path: Path, scene: Path, run: Run
 ) -> None:
@@ -424,6 +427,7 @@ def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
     assert not (tmp_path / "report.h5.parts").exists()
 
 
+@pytest.mark.slow
 def test_what_the_samples_miss_is_certified_told_and_fails_on_clash(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,6 +1,7 @@
 """The command line as a whole: help, documentation, errors, and how it leaves."""
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +14,9 @@ from click.testing import CliRunner
 from hybridve.calib.errors import HybridveError
 from hybridve.cli.main import cli
 
-README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+PROJECT = Path(__file__).parent.parent
+README = (PROJECT / "README.md").read_text(encoding="utf-8")
+PAGE = (PROJECT / "cli" / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", list(cli.commands))
@@ -25,6 +28,20 @@ def test_every_command_is_in_the_readme_and_its_help_tells_what_it_does(name: st
     assert command.short_help
     if any(isinstance(parameter, click.Argument) for parameter in command.params):
         assert f"hybridve {name} " in command.help.split("Example:")[1]
+
+
+@pytest.mark.parametrize("name", list(cli.commands))
+def test_the_options_that_the_page_tells_of_a_command_exist(name: str) -> None:
+    (row,) = (line for line in PAGE.splitlines() if line.startswith(f"| `hybridve {name} "))
+    known = {
+        option
+        for parameter in cli.commands[name].params
+        for option in [*parameter.opts, *parameter.secondary_opts]
+    }
+
+    told = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", row))
+
+    assert told <= known, told - known
 
 
 @pytest.mark.parametrize("name", ["", *cli.commands])

@@ -124,6 +124,7 @@ def test_what_is_nearer_than_required_is_a_patch_with_bounds_of_its_own(
         assert min(patch.clearance_m[0] for patch in patches) <= whole.upper_m
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_patches_share_out_the_points_and_the_nearest_of_them_is_the_clearance(seed: int) -> None:

@@ -9,6 +9,7 @@ from helpers.hulls import ball_hull
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from hybridve.hull.contact.outline_errors import OutlineErrors
 from hybridve.hull.contact.spacing import (
     NOTHING,
     Move,
@@ -19,7 +20,7 @@ from hybridve.hull.contact.spacing import (
     union,
 )
 from hybridve.hull.contact.spacing_doubt import UnsureShifts, unsure_shifts
-from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubter, OutlineErrors
+from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubter
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
 
@@ -169,6 +170,7 @@ def test_known_shifts_are_not_asked_for_again(task: ErringTask, hull: Hull) -> N
     assert blocked_by(hull, wall, move, everything)[2] == 0
 
 
+@pytest.mark.slow
 def test_the_shift_at_95_percent_suffices_in_95_percent_of_recordings() -> None:
     """Two frames, the first decides. 200 repeats and more: tests/benchmarks/bench_spacing_doubt."""
     rng = np.random.default_rng(11)

@@ -12,6 +12,7 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parent.parent
 PACKAGES = ("hybridve.calib", "hybridve.hull", "hybridve.cli")
+MAKEFILE = (PROJECT / "Makefile").read_text(encoding="utf-8")
 
 
 def modules() -> list[str]:
@@ -43,13 +44,68 @@ def test_there_are_examples() -> None:
     assert len(examples) >= 4
 
 
-@pytest.mark.parametrize("page", ["README.md", "tests/README.md", "data/README.md"])
-def test_tests_and_benchmarks_that_a_page_names_exist(page: str) -> None:
+README = PROJECT / "README.md"
+ROOMS = ("calib", "cli", "data", "hull", "tests")
+
+#: Every page, as its path in the project.
+PAGES = sorted(
+    page.relative_to(PROJECT).as_posix()
+    for page in [
+        *PROJECT.glob("*.md"),
+        *(p for room in ROOMS for p in (PROJECT / room).rglob("*.md")),
+    ]
+)
+
+
+def links_of(page: Path) -> list[tuple[Path, str]]:
+    """Return what a page links to or shows in the project: the file, and the place in it or ""."""
+    targets = re.findall(
+        r"\]\(([^)\s]+)(?: \"[^\"]*\")?\)", without_code(page.read_text(encoding="utf-8"))
+    )
+    inside = [target for target in targets if not re.match(r"[a-z]+:", target)]
+    parts = [target.partition("#") for target in inside]
+    return [((page.parent / name).resolve() if name else page, at) for name, _, at in parts]
+
+
+def without_code(text: str) -> str:
+    return re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def places_in(page: Path) -> set[str]:
+    """Return the names that headings have as places to link to."""
+    heads = re.findall(r"^#+ (.+)$", without_code(page.read_text(encoding="utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_what_a_page_links_to_is_there(page: str) -> None:
+    for target, at in links_of(PROJECT / page):
+        assert target.exists(), f"{page} links to {target}"
+        assert not at or at in places_in(target), f"{page} links to {target}#{at}"
+
+
+def test_every_page_is_one_click_from_the_readme() -> None:
+    linked = {target for target, _ in links_of(README)}
+
+    assert {PROJECT / page for page in PAGES} - linked == {README}
+
+
+def test_the_readme_is_a_face_and_not_the_whole() -> None:
+    assert README.stat().st_size <= 13_000
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_files_and_targets_that_a_page_names_are_there(page: str) -> None:
     text = (PROJECT / page).read_text(encoding="utf-8")
 
-    named = set(re.findall(r"((?:property/)?test_\w+\.py|bench_\w+\.py)", text)) - {"test_x.py"}
+    tests = set(re.findall(r"((?:property/)?test_\w+\.py|bench_\w+\.py)", text)) - {"test_x.py"}
+    paths = set(re.findall(r"`((?:calib|cli|data|hull|tests)/[\w/.]+)`", text))
+    targets = set(re.findall(r"`make ([\w-]+)", text))
 
-    for name in named:
+    for name in tests:
         folders = ["tests/benchmarks"] if name.startswith("bench_") else ["tests", "tests/property"]
         assert any((PROJECT / folder / name).is_file() for folder in folders), name
-    assert named or page == "data/README.md"
+    for name in paths:
+        assert (PROJECT / name).exists(), name
+    for name in targets:
+        assert re.search(rf"^{name}:", MAKEFILE, re.MULTILINE), f"make {name}"

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -67,6 +68,7 @@ def asked(tmp_path: Path, *options: str, ci: str = "") -> list[str]:
     return [line for line in done.stdout.splitlines() if line.startswith("asked")]
 
 
+@pytest.mark.slow
 def test_examples_are_the_same_in_every_run_and_new_ones_follow_from_the_seed(
     tmp_path: Path,
 ) -> None:

@@ -81,6 +81,7 @@ def test_without_a_cache_nothing_is_kept(
     assert sorted(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
+@pytest.mark.slow
 def test_without_a_cache_code_is_compiled_all_the_same(tmp_path: Path) -> None:
     code = (
         "import numpy as np\n"

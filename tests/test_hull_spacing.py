@@ -14,8 +14,8 @@ from hybridve.hull.cad.scene import Scene, load_scene
 from hybridve.hull.capture.recording import FrameRange, silhouettes_of
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import Chain, EvaluateSettings, make_chain
+from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.spacing import Move, covers, union
-from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.query.silhouettes import make_hull
 from hybridve.hull.report.spacing_file import (
     SessionSpacing,

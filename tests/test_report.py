@@ -172,6 +172,7 @@ def datasets(path: Path, *, but: str = "stage_s") -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results())
 def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]) -> None:
@@ -305,6 +306,7 @@ COLUMNS_OF_CONTACT = {
 }
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results())
 def test_every_column_is_read_back_and_what_is_missing_is_nan_nought_or_empty(
@@ -353,6 +355,7 @@ def test_a_column_with_a_number_for_each_camera_names_them(tmp_path: Path) -> No
         assert tuple(column.attrs["cameras"]) == CAMERAS
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results(), data=st.data())
 def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
@@ -379,6 +382,7 @@ def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["resumed.h5", "whole.h5"]
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results(), data=st.data())
 def test_vtk_reads_the_points_of_every_frame(

@@ -31,9 +31,10 @@ from hybridve.hull.query.silhouettes import Hull, make_hull, make_views
 from hybridve.hull.report import sweep_file
 from hybridve.hull.report.sweep_file import Sweep, held, read_sweep, sweep_as_dict, write_sweep
 from hybridve.hull.sweep.cost import fit_cost, window_px_read
-from hybridve.hull.sweep.experiment import Outcome, make_rows, run_sweep, samples_asked
+from hybridve.hull.sweep.experiment import Outcome, run_sweep
 from hybridve.hull.sweep.frames import HullFrame, near_bodies, spread_frames
 from hybridve.hull.sweep.front import pareto_front
+from hybridve.hull.sweep.judgement import make_rows, samples_asked
 from hybridve.hull.sweep.room import EngineRoom
 from hybridve.hull.sweep.truth import (
     BodyTruth,

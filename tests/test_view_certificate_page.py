@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.errors import ReportError
+from hybridve.calib.errors import CalibrationError
 from hybridve.calib.judging.certificate import (
     Certificate,
     SeenPoints,
@@ -35,18 +35,10 @@ from hybridve.calib.lens import cam_from_img, parameter_names, project_points
 from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion
 from hybridve.calib.rig import POSE_PARAMETERS, Rig, RigCovariance
 from hybridve.calib.solving.covariance import point_errors
-from hybridve.hull.view.certificate_charts import (
-    CELLS,
-    binned_means,
-    cell_counts,
-    draw_camera,
-    draw_errors,
-    draw_rig,
-    frustum,
-    nice,
-    slice_errors,
-)
+from hybridve.hull.view.certificate_charts import CELLS, binned_means, cell_counts, draw_camera
 from hybridve.hull.view.certificate_page import render, state_of, write_certificate_page
+from hybridve.hull.view.chart_marks import nice
+from hybridve.hull.view.rig_charts import draw_errors, draw_rig, frustum, slice_errors
 
 NOISE_PX = 0.25
 NOISE = Noise(NOISE_PX, NOISE_PX, NOISE_PX * np.sqrt(2.0), 0.987, 1234, 56)
@@ -236,6 +228,7 @@ def test_markup_in_names_and_values_is_text(tmp_path: Path) -> None:
         ElementTree.fromstring(image)
 
 
+@pytest.mark.slow
 def test_equal_input_gives_the_same_bytes(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -318,12 +311,13 @@ def test_a_rig_without_covariance_or_of_other_cameras_is_refused(
         page_of(tmp_path, (rig.only(["right", "left"]), certificate, seen, volume))
 
 
+@pytest.mark.slow
 def test_a_page_cut_off_leaves_nothing(
     tmp_path: Path,
     two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(ReportError, match="cannot be written"):
+    with pytest.raises(CalibrationError, match="cannot be written"):
         page_of(tmp_path / "no", two)
 
     def interrupt(self: Path, *_: object, **__: object) -> None:

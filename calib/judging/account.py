@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Board, Observations, is_seen
 from hybridve.calib.judging.certificate import working_volume
 from hybridve.calib.placing.fixed_cameras import Solved, other_tilt
+from hybridve.calib.placing.moments import PoseKey
 from hybridve.calib.placing.moving_cameras import Mounted
 from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.record import (
@@ -84,22 +85,16 @@ def put_together(
     pixels: dict[str, NDArray[np.float64]] = {}
     residuals: dict[str, NDArray[np.float64]] = {}
     views: Sequence[tuple[BundleView, NDArray[np.float64]]] = ()
+    keys: Sequence[PoseKey] = ()
     if solved is not None:
+        keys = solved.linked.pose_keys
         views = list(zip(solved.adjusted.bundle.views, solved.adjusted.residuals_px, strict=True))
     told: dict[str, CameraRecord] = {}
     mounts = {one.camera.name: one.told for one in mounted}
     for index, (seen, lens) in enumerate(zip(observations, lenses, strict=True)):
         own = [(view, missed) for view, missed in views if view.camera == index]
-        clip = [
-            missed
-            for view, missed in own
-            if solved is not None and isinstance(solved.linked.pose_names[view.pose][0], int)
-        ]
-        alone = [
-            missed
-            for view, missed in own
-            if solved is not None and isinstance(solved.linked.pose_names[view.pose][0], str)
-        ]
+        clip = [missed for view, missed in own if keys[view.pose].moment.is_clip]
+        alone = [missed for view, missed in own if not keys[view.pose].moment.is_clip]
         if own:
             every = np.concatenate([missed for _, missed in own])
             found = is_seen(every)

@@ -63,6 +63,9 @@ _BETTER = 0.8
 #: Noise of single points should explain this share of the residuals at least.
 _LEAST_EXPLAINED = 0.5
 
+#: A second opinion that differs by less is told as within this.
+_FINEST_M = 1e-6
+
 #: Residuals smaller than this explain nothing and need no explanation.
 _NEGLIGIBLE_PX = 0.01
 
@@ -546,7 +549,7 @@ def opinion_text(opinion: SecondOpinion | NoOpinion) -> str:
         return f"no second opinion: {opinion.reason}"
     return (
         "second opinion: COLMAP's own adjustment places what the cameras see within "
-        f"{millimetres(opinion.difference95_m)} mm of where the rig does (95 %), or "
+        f"{millimetres(max(opinion.difference95_m, _FINEST_M))} mm of where the rig does (95 %), or "
         f"{opinion.sigmas:.1f} standard deviations of its error, which is "
         f"{millimetres(opinion.expected95_m)} mm (95 %)"
     )

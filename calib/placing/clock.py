@@ -25,7 +25,6 @@ import numpy as np
 
 from hybridve.calib.boards.board import Board, Observations, Sighting
 from hybridve.calib.camera import Camera
-from hybridve.calib.image_io import natural_order
 from hybridve.calib.placing.board_tracks import (
     interpolated,
     jumped_keys,
@@ -93,29 +92,29 @@ def estimate_offsets(
     lenses : sequence of SolvedLens
         The lenses of the cameras.
     observations : sequence of Observations
-        What the same cameras saw; every frame of the clip, so that neighbours can be interpolated.
+        What the same cameras saw, in order of their names; every frame of the clip, so that
+        neighbours can be interpolated.
     max_offset_frames : int
         The largest offset between two cameras that is looked for.
     """
-    order = sorted(range(len(lenses)), key=lambda index: natural_order(observations[index].name))
-    names = [observations[index].name for index in order]
+    names = [seen.name for seen in observations]
     n_cameras = len(names)
     offsets, stds = np.full(n_cameras, np.nan), np.full(n_cameras, np.nan)
     offsets[0] = stds[0] = 0.0
     notes: dict[int, str] = {}
     left_out: dict[str, tuple[int, ...]] = dict.fromkeys(names, ())
     rms_px = np.nan
-    if any(observations[index].is_still for index in order):
+    if any(seen.is_still for seen in observations):
         notes |= dict.fromkeys(range(1, n_cameras), "the boards lie still in the clip")
     elif n_cameras > 1:
-        cameras = [lenses[index].camera for index in order]
-        tracks = [tracks_of(observations[index].sightings) for index in order]
+        cameras = [lens.camera for lens in lenses]
+        tracks = [tracks_of(seen.sightings) for seen in observations]
         spacing = spacing_of(tracks)
-        tracks = [listed_alike(boards, seen, spacing) for seen in tracks]
-        for camera, seen in enumerate(tracks):
-            jumped = jumped_keys(seen, spacing)
+        tracks = [listed_alike(boards, track, spacing) for track in tracks]
+        for camera, track in enumerate(tracks):
+            jumped = jumped_keys(track, spacing)
             left_out[names[camera]] = tuple(sorted({instant for _, instant in jumped}))
-            tracks[camera] = {key: seen[key] for key in seen if key not in jumped}
+            tracks[camera] = {key: track[key] for key in track if key not in jumped}
         poses = [located(boards, *pair) for pair in zip(cameras, tracks, strict=True)]
         start = start_of(boards, poses, spacing, max_offset_frames)
         for index in range(1, n_cameras):

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Board, Observations, is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.image_io import natural_order
 from hybridve.calib.placing.labelling import label_still_boards
 from hybridve.calib.placing.link import Linked, link_cameras
 from hybridve.calib.placing.marks import Mark
+from hybridve.calib.placing.moments import Body, body_of
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.placing.world import SeenBoards, place_world
 from hybridve.calib.pose import Pose, compose, invert
@@ -222,7 +222,7 @@ def adjust_weighed(
     even = adjust(bundle)
     groups = [
         "board clip"
-        if isinstance(linked.pose_names[view.pose][0], int)
+        if linked.pose_keys[view.pose].moment.is_clip
         else f"stills of {bundle.cameras[view.camera].name}"
         for view in bundle.views
     ]
@@ -302,7 +302,7 @@ def _world_errors(
 
 def _seen_boards(boards: Sequence[Board], linked: Linked, bundle: Bundle) -> SeenBoards:
     return SeenBoards(
-        boards, bundle.body_from_board, bundle.rig_from_body, linked.pose_names, bundle.views
+        boards, bundle.body_from_board, bundle.rig_from_body, linked.pose_keys, bundle.views
     )
 
 
@@ -319,7 +319,7 @@ def make_bundle(
     of which they save none.
     """
     held, _, _ = SeenBoards(
-        boards, linked.body_from_board, linked.rig_from_body, linked.pose_names, linked.views
+        boards, linked.body_from_board, linked.rig_from_body, linked.pose_keys, linked.views
     ).main()
     rig_from_held = linked.rig_from_body[held]
     held_from_rig = invert(rig_from_held)
@@ -334,9 +334,9 @@ def make_bundle(
         for number, lens in zip(lens_of, lenses, strict=True)
         if requests.get(lens.camera.name, LensRequest()).params is not None
     }
-    bodies: dict[str, int] = {}
-    for board in sorted(range(len(boards)), key=lambda index: natural_order(boards[index].name)):
-        bodies.setdefault(boards[board].body or f"{boards[board].name}/", board)
+    bodies: dict[Body, int] = {}
+    for index, board in enumerate(boards):
+        bodies.setdefault(body_of(board), index)
     return Bundle(
         points_board=tuple(board.points_board for board in boards),
         cameras=tuple(
@@ -364,7 +364,7 @@ def _rigid(pose: Pose) -> Pose:
 def _refuse_wrong_clips(rough: Adjusted, linked: Linked) -> None:
     for view, missed in zip(rough.bundle.views, rough.residuals_px, strict=True):
         missed_px = rms(missed[is_seen(missed)])
-        is_clip = isinstance(linked.pose_names[view.pose][0], int)
+        is_clip = linked.pose_keys[view.pose].moment.is_clip
         if is_clip and missed_px > _WRONG_CLIP_PX:
             name = rough.bundle.cameras[view.camera].name
             raise CalibrationError(
@@ -379,7 +379,7 @@ def _disagreeing(
     """Return a warning if no rig explains what the cameras saw, though their lenses do."""
     squares: list[list[float]] = [[] for _ in lenses]
     for view, missed in zip(rough.bundle.views, rough.residuals_px, strict=True):
-        if isinstance(linked.pose_names[view.pose][0], int):
+        if linked.pose_keys[view.pose].moment.is_clip:
             squares[view.camera] += (missed[is_seen(missed)] ** 2).sum(axis=1).tolist()
     missed_px = [float(np.sqrt(np.mean(own))) if own else 0.0 for own in squares]
     worst = max(
@@ -406,7 +406,7 @@ def _odd_one_out(boards: Sequence[Board], linked: Linked, bundle: Bundle) -> int
     for view in bundle.views:
         camera = bundle.cameras[view.camera]
         located = locate_board(camera, boards[view.board].points_board, view.pixels)
-        if located is not None and isinstance(linked.pose_names[view.pose][0], int):
+        if located is not None and linked.pose_keys[view.pose].moment.is_clip:
             placed.setdefault((view.pose, view.board), {})[view.camera] = located[0]
     count = len(bundle.cameras)
     apart = np.full((count, count), np.nan)

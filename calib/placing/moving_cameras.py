@@ -1,5 +1,6 @@
 """Moving cameras on their trackers, beside the fixed ones of a rig."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -48,15 +49,12 @@ def mount(
 
 def _still_boards(boards: Sequence[Board], seen: Observations, solved: "Solved") -> dict[int, Pose]:
     """Return where the boards lie that were still in the clip of the fixed cameras."""
-    bundle = solved.adjusted.bundle
+    bundle, keys = solved.adjusted.bundle, solved.linked.pose_keys
+    moments = Counter(key.body for key in keys if key.moment.is_clip)
     found: dict[int, Pose] = {}
     for view in bundle.views:
-        instants = {
-            name[0]
-            for index, name in enumerate(solved.linked.pose_names)
-            if isinstance(name[0], int) and name[1] == solved.linked.pose_names[view.pose][1]
-        }
-        if isinstance(solved.linked.pose_names[view.pose][0], int) and len(instants) == 1:
+        key = keys[view.pose]
+        if key.moment.is_clip and moments[key.body] == 1:
             rig_from_board = compose(
                 bundle.rig_from_body[view.pose], bundle.body_from_board[view.board]
             )

@@ -20,6 +20,7 @@ from hybridve.calib.boards.board import Board
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.marks import Mark, click_warnings, rounded, triangulated
+from hybridve.calib.placing.moments import PoseKey
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.record import WorldRecord
 from hybridve.calib.solving.bundle import BundleView
@@ -65,8 +66,8 @@ class SeenBoards:
         The boards.
     body_from_board, rig_from_body : sequence of (3, 4) float64
         Where boards sit on their bodies, and where bodies were.
-    pose_names : sequence of (int or str, str)
-        Of each of `rig_from_body` the instant of the clip (or the still's name), and the body.
+    pose_keys : sequence of PoseKey
+        What each of `rig_from_body` is of.
     views : sequence of BundleView
         What was seen.
     """
@@ -74,12 +75,17 @@ class SeenBoards:
     boards: Sequence[Board]
     body_from_board: Sequence[Pose]
     rig_from_body: Sequence[Pose]
-    pose_names: Sequence[tuple[int | str, str]]
+    pose_keys: Sequence[PoseKey]
     views: Sequence[BundleView]
 
     def rig_from_board(self, pose: int, board: int) -> Pose:
         """Return where a board was."""
         return compose(self.rig_from_body[pose], self.body_from_board[board])
+
+    @property
+    def instants(self) -> set[int]:
+        """The instants of the clip at which boards were seen."""
+        return {key.moment.instant for key in self.pose_keys if key.moment.is_clip}
 
     def main(self) -> tuple[int, int, frozenset[int]]:
         """Return the pose and board that most cameras see, the earliest of these; and who does.
@@ -92,9 +98,8 @@ class SeenBoards:
             seeing.setdefault((view.pose, view.board), set()).add(view.camera)
 
         def rank(key: tuple[int, int]) -> tuple[bool, int, int, int, int]:
-            instant = self.pose_names[key[0]][0]
-            is_still = isinstance(instant, str)
-            return (is_still, -len(seeing[key]), 0 if is_still else int(instant), key[1], key[0])
+            moment = self.pose_keys[key[0]].moment
+            return (not moment.is_clip, -len(seeing[key]), moment.instant, key[1], key[0])
 
         if not seeing:
             raise CalibrationError("no view of a board is left to place the world by")
@@ -142,9 +147,8 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
     """
     pose, board, seeing = seen.main()
     world_from_rig = invert(seen.rig_from_board(pose, board))
-    instant, _ = seen.pose_names[pose]
-    n_instants = len({name for name, _ in seen.pose_names if isinstance(name, int)})
-    is_still = n_instants == 1 and isinstance(instant, int)
+    moment = seen.pose_keys[pose].moment
+    is_still = moment.is_clip and len(seen.instants) == 1
     heights = _heights(cameras, world_from_rig)
     below = [index for index in range(len(cameras)) if heights[index] <= 0]
     wrong = [index for index in below if index in seeing]
@@ -162,7 +166,7 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
     text = (
         "the board as it lies in the clip"
         if is_still
-        else f"the board in {f'frame {instant}' if isinstance(instant, int) else instant}"
+        else f"the board in {f'frame {moment.instant}' if moment.is_clip else moment.image}"
     )
     return Placed(
         world_from_rig,
@@ -170,7 +174,7 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
             kind="board",
             text=text,
             board=str(seen.boards[board]),
-            instant=instant,
+            instant=moment.instant if moment.is_clip else moment.image,
             cameras=tuple(sorted(cameras[index].name for index in seeing)),
             warnings=tuple(warnings),
         ),
@@ -335,18 +339,13 @@ def place_on_floor(
 
 
 def _still_corners(seen: SeenBoards) -> tuple[NDArray[np.float64], list[str]]:
-    instants = {name for name, _ in seen.pose_names if isinstance(name, int)}
-    if len(instants) != 1:
+    if len(seen.instants) != 1:
         raise CalibrationError(
             "the floor cannot be told: no point of it is named ([[point]] with floor = true), and "
             "the boards do not lie still in the clip"
         )
     lying = sorted(
-        {
-            (view.pose, view.board)
-            for view in seen.views
-            if isinstance(seen.pose_names[view.pose][0], int)
-        }
+        {(view.pose, view.board) for view in seen.views if seen.pose_keys[view.pose].moment.is_clip}
     )
     corners = [
         transform(seen.rig_from_board(pose, board), seen.boards[board].points_board)

@@ -185,7 +185,7 @@ def _options(loss_px: float) -> pycolmap.BundleAdjustmentOptions:
     solver.num_threads = 1
     solver.max_num_iterations = _MAX_STEPS
     solver.gradient_tolerance = 1e-10
-    solver.function_tolerance = 1e-14
+    solver.function_tolerance = 1e-12
     solver.parameter_tolerance = 1e-12
     return options
 

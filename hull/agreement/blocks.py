@@ -18,11 +18,12 @@ from hybridve.hull.agreement.search import (
     FOUND,
     Images,
     Pencils,
-    count_pixels,
     counts,
     search_cells,
 )
 from hybridve.hull.jit import ZERO, compiled
+from hybridve.hull.query.boxes import count_pixels
+from hybridve.hull.query.points import project
 
 #: Points of a lattice to each side, and how far apart they are, in sides of a block.
 _LATTICE, _SPACING = 96, 0.5
@@ -65,14 +66,9 @@ def _confirm(
 ) -> None:
     """Confirm the blocks of all cameras that a point, local frame, projects into."""
     for camera in range(len(sizes)):
-        m00, m01, m02, m03 = matrices[camera, 0]
-        m10, m11, m12, m13 = matrices[camera, 1]
-        m20, m21, m22, m23 = matrices[camera, 2]
-        depth_m = m20 * x + m21 * y + m22 * z + m23
+        depth_m, pixel_x, pixel_y = project(x, y, z, matrices[camera])
         if not depth_m > 0.0:
             continue
-        pixel_x = (m00 * x + m01 * y + m02 * z + m03) / depth_m
-        pixel_y = (m10 * x + m11 * y + m12 * z + m13) / depth_m
         side = sides_px[camera]
         columns, rows = sizes[camera, 0] // side, sizes[camera, 1] // side
         if 0.0 <= pixel_x < columns * side and 0.0 <= pixel_y < rows * side:
@@ -189,14 +185,21 @@ def find_blocks(
         for row in range(rows):
             top = row * side
             in_row = count_pixels(
-                ZERO, width, top, top + side, width, height, first, images.integrals
+                ZERO, width - 1, top, top + side - 1, width, height, first, images.integrals
             )
             if in_row < side * side:
                 continue
             for column in range(columns):
                 left = column * side
                 n_object = count_pixels(
-                    left, left + side, top, top + side, width, height, first, images.integrals
+                    left,
+                    left + side - 1,
+                    top,
+                    top + side - 1,
+                    width,
+                    height,
+                    first,
+                    images.integrals,
                 )
                 if n_object < side * side:
                     continue
@@ -218,8 +221,7 @@ def find_blocks(
                     most_cells,
                 )
                 if verdict == FOUND:
-                    m = matrices[camera]
-                    depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+                    depth_m, _, _ = project(x, y, z, matrices[camera])
                     _flood(
                         x,
                         y,

@@ -103,8 +103,7 @@ def common_view(views: Views) -> CommonView:
 def facing_away(views: Views) -> tuple[str, ...]:
     """Return the cameras behind which all optical axes come together; none if they are parallel."""
     matrices = views.img_from_local
-    centers = np.asarray(-np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0])
-    meeting = nearest_to_axes(centers, matrices[:, 2, :3], _PARALLEL)
+    meeting = nearest_to_axes(views.centers_local(), matrices[:, 2, :3], _PARALLEL)
     if meeting is None:
         return ()
     depths_m = matrices[:, 2, :3] @ meeting + matrices[:, 2, 3]

@@ -29,8 +29,8 @@ Rounding: u and v are counted in image widths from the image's middle, so that t
 is well conditioned (a condition number kappa of some 10). H, e and h are then off by at most
 256 u kappa B_k, u the unit roundoff and B_k the sum of the sizes of all terms: rectangles are
 widened by that, over the smallest depth. So is A's own rectangle, by `_OWN_PX`, as its pixels are
-the floor of what was computed. A point is called found only where it keeps 1e-7 px from the edges
-of its pixels (or from the edges of the grown silhouettes' pixels): whoever asks again agrees.
+the floor of what was computed. A point is called found only where it keeps `EDGE_PX` from the
+edges of its pixels (or of the grown silhouettes' pixels): whoever asks again agrees.
 `hybridve.hull.agreement.search_reference` is the specification.
 """
 
@@ -41,6 +41,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
+from hybridve.hull.query.boxes import (
+    ABSTAINS,
+    ACCEPTS,
+    REJECTS,
+    UNDECIDED,
+    count_pixels,
+    pixel_range,
+    rectangle_vote,
+)
+from hybridve.hull.query.points import EDGE_PX, is_clear, project
 from hybridve.hull.query.silhouettes import Hull, Views
 
 #: What a search ends with: no point, proved; a point; neither within the cells allowed.
@@ -58,9 +68,6 @@ _FINEST_PX = 2.0**-10
 
 #: A camera's own rectangle is widened by this, in pixels: a thousand times its rounding.
 _OWN_PX = 1e-9
-
-#: A point this near to the edge of a pixel, in pixels, is not called found.
-_EDGE_PX = 1e-7
 
 #: Depth below which nothing is told from the camera's own plane, in lengths of S.
 _SMALLEST_DEPTH = 1e-30
@@ -90,8 +97,8 @@ class Pencils(NamedTuple):
         [H | e] of each pair, first the camera whose rays they are.
     pads : (C, C, 3) float64
         By how much h may be off.
-    matrices : (C, 3, 4) float64
-        Projections in pixels from metres, local frame.
+    matrices : (C, 12) float64
+        Projections in pixels from metres, local frame, row-major.
     sizes : (C, 2) int64
         Width and height of the images, in pixels.
     """
@@ -106,11 +113,14 @@ class Pencils(NamedTuple):
 
 
 class Images(NamedTuple):
-    """The silhouettes of one frame as compiled loops take them; see `Hull`."""
+    """The silhouettes of one frame as compiled loops take them, cameras as in the views.
+
+    See `hybridve.hull.query.frame.Frame`.
+    """
 
     integrals: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
-    recorded_offset: NDArray[np.int64]
+    recorded: NDArray[np.int64] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,14 +212,15 @@ def make_pencils(views: Views) -> Pencils:
         scales_m,
         np.ascontiguousarray(seen),
         np.ascontiguousarray(pads),
-        matrices,
+        matrices.reshape(-1, 12),
         np.array(views.sizes_px, order="C"),
     )
 
 
 def images_of(hull: Hull) -> Images:
     """Return the silhouettes of a frame as compiled loops take them."""
-    return Images(hull.integrals_flat, hull.integral_offset, hull.recorded_offset)
+    recorded = None if hull.views.seen is None else hull.recorded_offset
+    return Images(hull.integrals_flat, hull.integral_offset, recorded)
 
 
 def bounding_box(hull: Hull, camera: int, grown_px: int = 0) -> tuple[float, float, float, float]:
@@ -293,54 +304,6 @@ def search_hull(hull: Hull, pencils: Pencils, rule: Rule, most_cells: int = MOST
 
 
 @compiled
-def count_pixels(
-    x0: int,
-    x1: int,
-    y0: int,
-    y1: int,
-    width: int,
-    height: int,
-    first: int,
-    integrals: NDArray[np.int32],
-) -> int:
-    """Return how many object pixels are in columns x0..x1 - 1 and rows y0..y1 - 1 of an image."""
-    x0, x1 = max(x0, 0), min(x1, width)
-    y0, y1 = max(y0, 0), min(y1, height)
-    if x1 <= x0 or y1 <= y0:
-        return 0
-    above, below = first + y0 * (width + 1), first + y1 * (width + 1)
-    return int(
-        integrals[below + x1]
-        - integrals[above + x1]
-        - integrals[below + x0]
-        + integrals[above + x0]
-    )
-
-
-@compiled
-def is_wholly_recorded(
-    x0: int,
-    x1: int,
-    y0: int,
-    y1: int,
-    width: int,
-    height: int,
-    first: int,
-    integrals: NDArray[np.int32],
-) -> bool:
-    """Tell whether columns x0..x1 - 1 and rows y0..y1 - 1 are in an image, which recorded them all.
-
-    The integral image of what it recorded begins at `first`, which is below 0 if that is all.
-    """
-    if x0 < 0 or y0 < 0 or x1 > width or y1 > height:
-        return False
-    if first < 0:
-        return True
-    n_recorded = count_pixels(x0, x1, y0, y1, width, height, first, integrals)
-    return n_recorded == (x1 - x0) * (y1 - y0)
-
-
-@compiled
 def counts(
     x: float,
     y: float,
@@ -359,46 +322,36 @@ def counts(
     for camera in range(len(matrices)):
         if not is_asked[camera]:
             continue
-        m = matrices[camera]
         width, height, grown = sizes[camera, 0], sizes[camera, 1], tolerance_px[camera]
-        depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if depth_m > 0.0:
-            pixel_x = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth_m
-            pixel_y = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth_m
-            far = grown + _EDGE_PX
-            if -far < pixel_x < width + far and -far < pixel_y < height + far:
-                column, row = int(np.floor(pixel_x)), int(np.floor(pixel_y))
-                if (
-                    not _EDGE_PX < pixel_x - column < 1.0 - _EDGE_PX
-                    or not _EDGE_PX < pixel_y - row < 1.0 - _EDGE_PX
-                ):
-                    return False
-                n_object = count_pixels(
-                    column - grown,
-                    column + grown + 1,
-                    row - grown,
-                    row + grown + 1,
-                    width,
-                    height,
-                    integral_offset[camera],
-                    integrals,
-                )
-                if n_object > 0:
-                    n_seen += 1
-                    continue
-                if is_wholly_recorded(
-                    column - grown,
-                    column + grown + 1,
-                    row - grown,
-                    row + grown + 1,
-                    width,
-                    height,
-                    images.recorded_offset[camera],
-                    integrals,
-                ):
-                    return False
-        if not abstains[camera]:
+        depth_m, pixel_x, pixel_y = project(x, y, z, matrices[camera])
+        far = grown + EDGE_PX
+        if (
+            not depth_m > 0.0
+            or not -far < pixel_x < width + far
+            or not -far < pixel_y < height + far
+        ):
+            if not abstains[camera]:
+                return False
+            continue
+        if not is_clear(pixel_x, pixel_y, EDGE_PX):
             return False
+        column, row = np.int64(np.floor(pixel_x)), np.int64(np.floor(pixel_y))
+        vote = rectangle_vote(
+            column - grown,
+            column + grown,
+            row - grown,
+            row + grown,
+            width,
+            height,
+            integral_offset[camera],
+            integrals,
+            abstains[camera],
+            camera,
+            images.recorded,
+        )
+        if vote == REJECTS:
+            return False
+        n_seen += vote in (ACCEPTS, UNDECIDED)
     return n_seen >= needed
 
 
@@ -454,9 +407,9 @@ def search_cells(
         far, near = waiting[n_waiting, 4], waiting[n_waiting, 5]
         n_own = count_pixels(
             int(np.floor(left)) - own_grown,
-            int(np.ceil(right)) + own_grown,
+            int(np.ceil(right)) - 1 + own_grown,
             int(np.floor(top)) - own_grown,
-            int(np.ceil(bottom)) + own_grown,
+            int(np.ceil(bottom)) - 1 + own_grown,
             own_width,
             own_height,
             integral_offset[camera],
@@ -494,7 +447,7 @@ def search_cells(
             pad_x, pad_y, pad_z = pads[other, 0], pads[other, 1], pads[other, 2]
             # Where depths are this large, a pixel within twice the image is off by little.
             least = 16.0 * pad_z + _SMALLEST_DEPTH
-            is_wholly_seen, n_object = False, 0  # as if it never saw the cell
+            vote = ABSTAINS if abstains[other] else REJECTS  # as if it never saw the cell
             if z_max <= -least:
                 pass
             elif z_min >= least:
@@ -506,41 +459,44 @@ def search_cells(
                     y_min, y_max = min(y_min, ys[corner]), max(y_max, ys[corner])
                 pad_px_x = 2.0 * (pad_x + max(abs(x_min), abs(x_max)) * pad_z) / z_min
                 pad_px_y = 2.0 * (pad_y + max(abs(y_min), abs(y_max)) * pad_z) / z_min
-                border = grown + 2.0
-                x0 = int(np.floor(min(max(x_min - pad_px_x, -border), width + border))) - grown
-                x1 = int(np.floor(min(max(x_max + pad_px_x, -border), width + border))) + grown + 1
-                y0 = int(np.floor(min(max(y_min - pad_px_y, -border), height + border))) - grown
-                y1 = int(np.floor(min(max(y_max + pad_px_y, -border), height + border))) + grown + 1
-                if x1 > 0 and y1 > 0 and x0 < width and y0 < height:
-                    is_wholly_seen = is_wholly_recorded(
-                        x0, x1, y0, y1, width, height, images.recorded_offset[other], integrals
-                    )
-                    n_object = count_pixels(
-                        x0, x1, y0, y1, width, height, integral_offset[other], integrals
-                    )
-                    if is_wholly_seen and n_object == (x1 - x0) * (y1 - y0):
-                        if other < _MOST_BITS:
-                            accepts |= 1 << other
-                    else:
-                        for corner in range(8):
-                            if not corner & 1:
-                                across_x = max(
-                                    across_x,
-                                    abs(xs[corner + 1] - xs[corner]),
-                                    abs(ys[corner + 1] - ys[corner]),
-                                )
-                            if not corner & 2:
-                                across_y = max(
-                                    across_y,
-                                    abs(xs[corner + 2] - xs[corner]),
-                                    abs(ys[corner + 2] - ys[corner]),
-                                )
-                            if not corner & 4:
-                                along = max(
-                                    along,
-                                    abs(xs[corner + 4] - xs[corner]),
-                                    abs(ys[corner + 4] - ys[corner]),
-                                )
+                x0, x1 = pixel_range(x_min - pad_px_x, x_max + pad_px_x, width, grown)
+                y0, y1 = pixel_range(y_min - pad_px_y, y_max + pad_px_y, height, grown)
+                vote = rectangle_vote(
+                    x0,
+                    x1,
+                    y0,
+                    y1,
+                    width,
+                    height,
+                    integral_offset[other],
+                    integrals,
+                    abstains[other],
+                    other,
+                    images.recorded,
+                )
+                if vote == ACCEPTS:
+                    if other < _MOST_BITS:
+                        accepts |= 1 << other
+                elif x1 >= 0 and y1 >= 0 and x0 < width and y0 < height:
+                    for corner in range(8):
+                        if not corner & 1:
+                            across_x = max(
+                                across_x,
+                                abs(xs[corner + 1] - xs[corner]),
+                                abs(ys[corner + 1] - ys[corner]),
+                            )
+                        if not corner & 2:
+                            across_y = max(
+                                across_y,
+                                abs(xs[corner + 2] - xs[corner]),
+                                abs(ys[corner + 2] - ys[corner]),
+                            )
+                        if not corner & 4:
+                            along = max(
+                                along,
+                                abs(xs[corner + 4] - xs[corner]),
+                                abs(ys[corner + 4] - ys[corner]),
+                            )
             else:
                 # The cell is cut by the camera's own plane: beside the image, or anywhere.
                 left_most, right_most = -np.inf, -np.inf
@@ -558,8 +514,18 @@ def search_cells(
                     and top_most >= -slack_y
                     and bottom_most >= -slack_y
                 ):
-                    n_object = count_pixels(
-                        ZERO, width, ZERO, height, width, height, integral_offset[other], integrals
+                    vote = rectangle_vote(
+                        ZERO - 1,
+                        width,
+                        ZERO - 1,
+                        height,
+                        width,
+                        height,
+                        integral_offset[other],
+                        integrals,
+                        abstains[other],
+                        other,
+                        images.recorded,
                     )
                     by_x, by_y, by_t = 0.0, 0.0, 0.0
                     for corner in range(8):
@@ -574,14 +540,13 @@ def search_cells(
                         across_x = max(across_x, width * by_x / total)
                         across_y = max(across_y, width * by_y / total)
                         along = max(along, width * by_t / total)
-            if n_object > 0:
-                n_possible += 1
-            elif is_wholly_seen or not abstains[other]:
+            if vote == REJECTS:
                 is_free = True
                 for k in range(place, 0, -1):
                     order[k] = order[k - 1]
                 order[0] = other
                 break
+            n_possible += vote in (ACCEPTS, UNDECIDED)
         if is_free or n_possible < needed:
             continue
 

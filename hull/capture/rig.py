@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.calibrate import calibrate_rig
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import import_rig, read_rig, rig_to_dict
+from hybridve.calib.formats.rig_json import read_rig, rig_to_dict
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.formats.tracker import read_poses
 from hybridve.calib.image_io import FrameSource
 from hybridve.calib.judging.account import Calibration

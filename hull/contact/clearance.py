@@ -32,8 +32,9 @@ from hybridve.hull.contact.lattice import (
     DistanceLattice,
     bound_cells,
 )
-from hybridve.hull.query.cells import CellFrame, are_inside, make_cell_frame, split_cells
+from hybridve.hull.query.cells import CellFrame, make_cell_frame, split_cells
 from hybridve.hull.query.engine import checked_vertices
+from hybridve.hull.query.points import are_inside
 from hybridve.hull.query.silhouettes import Hull
 
 #: Half of the first root's edge at least, metres, and in sizes of the object. Farther than 16 times
@@ -459,7 +460,7 @@ class ClearanceMeter:
         best point; its distance is exact.
         """
         signed_m, nearest = self._surface.signed(point[None])
-        if signed_m[0] > 0 and are_inside(nearest, asked)[0]:
+        if signed_m[0] > 0 and are_inside(nearest, asked.offset_local, asked.frame)[0]:
             if best.distance_m[0] > 0:
                 best.distance_m[0], best.point[:] = 0.0, nearest[0]
         elif signed_m[0] < best.distance_m[0]:
@@ -473,7 +474,7 @@ class ClearanceMeter:
         for _ in range(n_looks):
             along_m = begin_m + reach_m * np.linspace(0.0, 1.0, _LOOK_POINTS)
             points = point + along_m[:, None] * away
-            inside = are_inside(points, asked)
+            inside = are_inside(points, asked.offset_local, asked.frame)
             if not inside.any():
                 return
             signed_m, _ = self._surface.signed(points)

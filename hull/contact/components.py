@@ -11,8 +11,8 @@ Silhouettes are sampled at the centres of pixels, so a real thing can stick out 
 part of a pixel. Everything here is therefore asked of the hull whose silhouettes are grown by one
 pixel (`grown`). That holds whatever is real, if it is not thinner than a pixel.
 
-Volumes are connected cells: space is cut into cubes, coarse to fine, and a cube is kept unless one
-camera sees no object pixel in the rectangle around its projection. What is connected in the hull
+Volumes are connected cells: space is cut into cubes, coarse to fine, and a cube is kept unless it
+is proved free (`hybridve.hull.query.cells`). What is connected in the hull
 is connected in cells, so volumes that are told apart are apart; two that come nearer to each other
 than some two cells may be told as one.
 
@@ -24,15 +24,6 @@ are grown by, or of a cell, is of one volume with the person, and that is proved
 contact with the phantom is then no contact with the person, and phantoms of litres were seen to be
 joined so. For a contact "real" is therefore an estimate, and only "unsure" is a warning. How far
 from a contact something real may be at most is bounded elsewhere (`hybridve.hull.contact.bulge`).
-
-The rectangle
--------------
-Let c be the centre of a cube of half side s, h = P c + p its homogeneous projection and x = h_x /
-h_z. A point of the cube is c + o with |o_j| <= s, and its x differs from the centre's by
-
-    (P_x o - x P_z o) / (h_z + P_z o),  at most  s sum_j |P_xj - x P_zj| / (h_z - s sum_j |P_zj|),
-
-y alike: an exact bound at a sixth of the work of projecting eight corners.
 
 References
 ----------
@@ -46,7 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hybridve.hull.jit import ZERO, compiled, inlined
+from hybridve.hull.query.bounds import FREE, FULL
+from hybridve.hull.query.cells import cube_bounds, cube_verdicts, make_cell_frame
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
 from hybridve.hull.query.walk import contains_few, spans_in_hull
 
@@ -65,11 +57,8 @@ _LEVELS = 7
 #: Cubes of one level, and cells of the box around all volumes, at most.
 _MOST_OPEN, _MOST_CELLS = 1 << 18, 1 << 22
 
-#: A cube nearer than this to a camera's plane is not projected: it stays.
+#: A cube nearer than this to a camera's plane is not projected.
 _NEAR_M = 1e-3
-
-#: Rounding of a rectangle in double precision is below 1e-8 px for what is not nearer.
-_ROUNDING_PX = 1e-6
 
 #: Coverage is drawn in blocks of so many pixels a side.
 _BLOCK_PX = 4
@@ -163,7 +152,7 @@ class Volumes:
             within &= taken[side, middle, middle] & taken[middle, side, middle]
             within &= taken[middle, middle, side]
         index = np.argwhere((self.number > 0) & ~within)
-        centers = np.asarray((index + self.first + 0.5) * self.cell_m, np.float64)
+        centers = np.ascontiguousarray((index + self.first + 0.5) * self.cell_m)
         return centers, self.number[tuple(index.T)].astype(np.int64) - 1
 
 
@@ -207,27 +196,19 @@ def connected_volumes(grown_hull: Hull, cell_m: float = CELL_M) -> Volumes:
 
 def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
     """Return cubes that are not proved free: first cells (N, 3), and how many cells wide."""
-    matrices = hull.views.img_from_local
-    centers_local = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0]
+    centers_local = hull.views.centers_local()
     reach_m = _REACH * float(np.linalg.norm(centers_local, axis=1).max())
     side = 1 << _LEVELS
     most = max(1, int(np.ceil(reach_m / (side * cell_m))))
     index = np.indices((2 * most, 2 * most, 2 * most)).reshape(3, -1).T
     cells = (index - most) * side
     octants = np.indices((2, 2, 2)).reshape(3, -1).T
+    asked = make_cell_frame(hull, hull.views.origin_world, most * side * cell_m, _NEAR_M)
     blocks = []
     while True:
-        is_free, is_full = _tell(
-            np.ascontiguousarray((cells + 0.5 * side) * cell_m, np.float64),
-            0.5 * side * cell_m,
-            np.ascontiguousarray(matrices),
-            np.ascontiguousarray(hull.views.sizes_px),
-            hull.integrals_flat,
-            hull.integral_offset,
-            None if hull.views.seen is None else hull.recorded_offset,
-            hull.views.unseen == "keep",
-            int(hull.views.min_cameras),
-        )
+        centers = np.ascontiguousarray((cells + 0.5 * side) * cell_m)
+        verdicts = cube_verdicts(centers, 0.5 * side * cell_m, asked)
+        is_free, is_full = verdicts == FREE, verdicts == FULL
         if side == 1:
             blocks.append((cells[~is_free], 1))
             return blocks
@@ -238,183 +219,6 @@ def _occupied(hull: Hull, cell_m: float) -> list[tuple[NDArray[np.int64], int]]:
             return blocks
         side //= 2
         cells = (cells[is_open, None] + octants * side).reshape(-1, 3)
-
-
-@compiled
-def _tell(
-    centers_local: NDArray[np.float64],
-    half_m: float,
-    matrices: NDArray[np.float64],
-    sizes: NDArray[np.int64],
-    integrals: NDArray[np.int32],
-    integral_offset: NDArray[np.int64],
-    recorded: NDArray[np.int64] | None,
-    keep: bool,
-    min_cameras: int,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which cubes (N, 3) hold no point of the hull, proved, and which hold nothing else."""
-    is_free = np.zeros(len(centers_local), np.bool_)
-    is_full = np.zeros(len(centers_local), np.bool_)
-    for i in range(len(centers_local)):
-        x, y, z = centers_local[i]
-        n_seeing, n_full, n_none, n_object = ZERO, ZERO, ZERO, ZERO
-        for camera in range(len(matrices)):
-            seen, full, none, has_object = _look(
-                x,
-                y,
-                z,
-                half_m,
-                matrices[camera],
-                sizes[camera, 0],
-                sizes[camera, 1],
-                integrals,
-                integral_offset[camera],
-                keep,
-                camera,
-                recorded,
-            )
-            n_seeing += seen
-            n_full += full
-            n_object += has_object
-            n_none += none or not (seen or keep)
-            if n_none:
-                break
-        needed = min_cameras if keep else len(matrices)
-        is_free[i] = n_none > 0 or n_object < needed
-        is_full[i] = not is_free[i] and n_full == n_seeing
-    return is_free, is_full
-
-
-@inlined
-def _look(
-    x: float,
-    y: float,
-    z: float,
-    half_m: float,
-    m: NDArray[np.float64],
-    width: int,
-    height: int,
-    integrals: NDArray[np.int32],
-    first: int,
-    keep: bool,
-    camera: int,
-    recorded: NDArray[np.int64] | None,
-) -> tuple[bool, bool, bool, bool]:
-    """Tell of a cube: a camera may see it; sees object only; background only; some object."""
-    depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    thick_m = half_m * (abs(m[2, 0]) + abs(m[2, 1]) + abs(m[2, 2]))
-    if depth_m + thick_m <= -_NEAR_M:
-        return False, False, False, False
-    if depth_m - thick_m <= _NEAR_M:  # it straddles the camera's plane, and projects anywhere
-        if not _may_be_seen(x, y, z, half_m, m, width, height):
-            return False, False, False, False
-        x0, x1, y0, y1 = 0, width, 0, height
-        is_seen_wholly = False
-    else:
-        per_depth, scale = 1.0 / depth_m, half_m / (depth_m - thick_m)
-        left, right = _interval(x, y, z, m[0], m[2], per_depth, scale)
-        top, bottom = _interval(x, y, z, m[1], m[2], per_depth, scale)
-        if right < 0 or bottom < 0 or left >= width or top >= height:
-            return False, False, False, False
-        is_seen_wholly = left >= 0 and top >= 0 and right < width and bottom < height
-        x0, x1 = int(max(left, 0.0)), int(min(right + 1.0, float(width)))
-        y0, y1 = int(max(top, 0.0)), int(min(bottom + 1.0, float(height)))
-    above, below = y0 * (width + 1), y1 * (width + 1)
-    area = (x1 - x0) * (y1 - y0)
-    if recorded is not None:  # not compiled where it is
-        start = recorded[camera]
-        if start >= 0:
-            n_seen = (
-                integrals[start + below + x1]
-                - integrals[start + above + x1]
-                - integrals[start + below + x0]
-                + integrals[start + above + x0]
-            )
-            if n_seen == 0:
-                return False, False, False, False
-            is_seen_wholly = is_seen_wholly and n_seen == area
-    count = (
-        integrals[first + below + x1]
-        - integrals[first + above + x1]
-        - integrals[first + below + x0]
-        + integrals[first + above + x0]
-    )
-    # Beyond its border, and where it recorded nothing, a camera that keeps abstains.
-    sees_none = count == 0 and (is_seen_wholly or not keep)
-    return True, is_seen_wholly and count == area, sees_none, count > 0
-
-
-@inlined
-def _interval(
-    x: float,
-    y: float,
-    z: float,
-    row: NDArray[np.float64],
-    third: NDArray[np.float64],
-    per_depth: float,
-    scale: float,
-) -> tuple[float, float]:
-    """Return the first and the last column (or row) of the rectangle around a cube."""
-    middle = (row[0] * x + row[1] * y + row[2] * z + row[3]) * per_depth
-    spread = (
-        abs(row[0] - middle * third[0])
-        + abs(row[1] - middle * third[1])
-        + abs(row[2] - middle * third[2])
-    )
-    reach = scale * spread + _ROUNDING_PX
-    return np.floor(middle - reach), np.floor(middle + reach)
-
-
-@compiled
-def _may_be_seen(
-    x: float,
-    y: float,
-    z: float,
-    half_m: float,
-    m: NDArray[np.float64],
-    width: int,
-    height: int,
-) -> bool:
-    """Tell whether a cube may hold a point that projects into the image.
-
-    Such a point is on the inner side of each of the four planes through the camera's centre and
-    the image's borders. A cube is beyond a plane if its innermost corner is; by `_NEAR_M` in
-    homogeneous pixels, to be sure of rounding.
-    """
-    for axis in range(2):
-        for border in range(2):
-            sign, of_depth = (-1.0, float(height if axis else width)) if border else (1.0, 0.0)
-            a = sign * m[axis, 0] + of_depth * m[2, 0]
-            b = sign * m[axis, 1] + of_depth * m[2, 1]
-            c = sign * m[axis, 2] + of_depth * m[2, 2]
-            innermost = a * x + b * y + c * z + sign * m[axis, 3] + of_depth * m[2, 3]
-            innermost += half_m * (abs(a) + abs(b) + abs(c))
-            if innermost < -_NEAR_M:
-                return False
-    return True
-
-
-def _rectangles(
-    matrix: NDArray[np.float64], centers_local: NDArray[np.float64], half_m: float
-) -> tuple[NDArray[np.float64], ...]:
-    """Return x, y of centres, reach in x and in y, nearest and farthest depth: (N,) each.
-
-    Pixels, where the nearest depth is above `_NEAR_M`; see this file's head.
-    """
-    h_x, h_y, depth_m = matrix[:, :3] @ centers_local.T + matrix[:, 3:]  # (N,) each
-    reach_z = half_m * np.abs(matrix[2, :3]).sum()
-    near_m, far_m = depth_m - reach_z, depth_m + reach_z
-    in_front = near_m > _NEAR_M
-    divisor = np.where(in_front, depth_m, 1.0)
-    x, y = h_x / divisor, h_y / divisor
-    divisor = np.where(in_front, near_m, 1.0)
-    reach = []
-    for row, middle in ((matrix[0], x), (matrix[1], y)):
-        spread = np.zeros(len(x))
-        for axis in range(3):
-            spread += np.abs(row[axis] - middle * matrix[2, axis])
-        reach.append(half_m * spread / divisor + _ROUNDING_PX)
-    return x, y, reach[0], reach[1], near_m, far_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -442,22 +246,22 @@ def cover(volumes: Volumes) -> Coverage:
         sizes = -(-volumes.hull.views.sizes_px // _BLOCK_PX)
         return Coverage([np.zeros((height, width), np.int64) for width, height in sizes])
     centers_local, volume = volumes.surface_local()
+    views = volumes.hull.views
+    half_m = 0.5 * volumes.cell_m
+    reach_m = float(np.abs(centers_local).max(initial=0.0)) + half_m
+    asked = make_cell_frame(volumes.hull, views.origin_world, reach_m, _NEAR_M)
     sole = []
-    for camera, (width, height) in enumerate(volumes.hull.views.sizes_px.tolist()):
-        matrix = volumes.hull.views.img_from_local[camera]
-        x, y, reach_x, reach_y, near_m, far_m = _rectangles(
-            matrix, centers_local, 0.5 * volumes.cell_m
-        )
+    for camera, (width, height) in enumerate(views.sizes_px.tolist()):
+        place = int(np.flatnonzero(asked.frame.order == camera)[0])
+        bounds_px = cube_bounds(centers_local, half_m, place, asked)
         columns, rows = -(-width // _BLOCK_PX), -(-height // _BLOCK_PX)
-        in_front = near_m > _NEAR_M
-        x0, x1 = _blocks(x, reach_x, in_front, columns)
-        y0, y1 = _blocks(y, reach_y, in_front, rows)
-        drawn = far_m > -_NEAR_M
+        x0, x1 = _blocks(bounds_px[:, :2], columns)
+        y0, y1 = _blocks(bounds_px[:, 2:], rows)
         stride = columns + 1
         corners = np.concatenate(
             [y0 * stride + x0, y1 * stride + x1, y0 * stride + x1, y1 * stride + x0]
         )
-        signs = np.repeat([1.0, 1.0, -1.0, -1.0], len(x)) * np.tile(drawn, 4)
+        signs = np.repeat([1.0, 1.0, -1.0, -1.0], len(volume))
         sums = []
         for power in range(3):
             # Integers below 2^53, and so exact: fewer than 2^20 cells of 2^15 volumes over a block.
@@ -472,18 +276,15 @@ def cover(volumes: Volumes) -> Coverage:
 
 
 def _blocks(
-    middle: NDArray[np.float64],
-    reach: NDArray[np.float64],
-    in_front: NDArray[np.bool_],
-    count: int,
+    range_px: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first block that each rectangle touches, and the one after its last."""
-    first = np.where(in_front, np.floor((middle - reach) / _BLOCK_PX), 0)
-    last = np.where(in_front, np.floor((middle + reach) / _BLOCK_PX) + 1, count)
-    return (
-        np.clip(first, 0, count).astype(np.int64),
-        np.clip(last, 0, count).astype(np.int64),
-    )
+    """Return the first block that each range (N, 2) touches, and the one after its last.
+
+    They are one where a range is empty, as that of a cell behind the camera is.
+    """
+    first = np.clip(np.floor(range_px[:, 0] / _BLOCK_PX), 0, count)
+    last = np.clip(np.floor(range_px[:, 1] / _BLOCK_PX) + 1, 0, count)
+    return first.astype(np.int64), np.maximum(first, last).astype(np.int64)
 
 
 def is_real_at(hull: Hull, grown_hull: Hull, point_world: NDArray[np.float64]) -> bool:
@@ -558,9 +359,8 @@ def _points_within(volumes: Volumes, volume: int) -> NDArray[np.float64]:
 
 def _object_pixels(hull: Hull, camera: int, points_world: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the object pixels (N, 2) that points (P, 3) project to: rows, columns, ascending."""
-    matrix = hull.views.img_from_local[camera]
     mask = hull.mask(camera)
-    h = (points_world - hull.views.origin_world) @ matrix[:, :3].T + matrix[:, 3]
+    h = hull.views.project(points_world, camera)
     h = h[h[:, 2] > 0]
     with np.errstate(over="ignore"):
         pixels = np.clip(h[:, 1::-1] / h[:, 2:], -1, mask.shape)

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from hybridve.hull.cad.distance import SurfaceDistance
 from hybridve.hull.jit import ZERO, compiled
-from hybridve.hull.query.cells import CellFrame, is_inside
+from hybridve.hull.query.cells import CellFrame
+from hybridve.hull.query.points import EDGE_PX, is_inside
 
 #: Corners that are remembered at most, some 50 MB; then all are forgotten, which changes no result.
 _MOST_CORNERS = 1 << 20
@@ -409,7 +410,7 @@ def bound_cells(
         frame.answers,
         frame.mask_offset,
     )
-    keep, min_cameras = frame.keep, frame.min_cameras
+    keep, min_cameras, every = frame.keep, frame.min_cameras, frame.every
     lower_m, value = np.zeros(len(center)), np.zeros(8)
     deepest, key, smallest_m = ZERO - 1, np.inf, best.distance_m[0]
     for i in range(len(center)):
@@ -470,12 +471,16 @@ def bound_cells(
                     x + along * to_x + offset_x,
                     y + along * to_y + offset_y,
                     z + along * to_z + offset_z,
+                    every,
+                    len(every),
+                    ZERO,
                     matrices,
                     sizes,
                     answers,
                     mask_offset,
                     keep,
                     min_cameras,
+                    EDGE_PX,
                 ):
                     way = along
                     break

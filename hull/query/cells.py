@@ -20,8 +20,8 @@ times as much over w_min (B_k as in `bounds`, u the unit roundoff), so that a re
 widened by 40 u (B_x + |p_x| B_z) / w_min holds the pixel of every point of the cube, and of every
 point that is computed within 16 u of one.
 
-A centre is called *inside* only where its pixel keeps 1e-7 px from the edges of its pixel in every
-camera, a thousand times what rounding moves it: whoever asks again gets the same answer.
+A centre is called *inside* only where it keeps `points.EDGE_PX` from the edges of its pixel in
+every camera: whoever asks again gets the same answer.
 """
 
 from typing import NamedTuple
@@ -29,24 +29,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.jit import ZERO, compiled
-from hybridve.hull.query.clusters import make_frame
-from hybridve.hull.query.rectangles import (
+from hybridve.hull.jit import ZERO, compiled, inlined
+from hybridve.hull.query.bounds import FREE, FULL, OPEN
+from hybridve.hull.query.boxes import (
     ACCEPTS,
     REJECTS,
     UNDECIDED,
-    Frame,
+    WITHHOLDS,
+    pixel_range,
     rectangle_vote,
 )
-from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, Hull
+from hybridve.hull.query.frame import Frame
+from hybridve.hull.query.points import EDGE_PX, is_inside, project
+from hybridve.hull.query.silhouettes import Hull
 
 _PAD = 40.0 * 2.0**-53
 
 #: From this multiple of B_z on a depth is told from zero, rounding or not.
 _NEAR = 1000.0 * 2.0**-53
-
-#: A point this near to the edge of a pixel, in pixels, is not called inside.
-_EDGE_PX = 1e-7
+_SMALLEST_NEAR_M = 1e-30
 
 
 class CellFrame(NamedTuple):
@@ -56,8 +57,9 @@ class CellFrame(NamedTuple):
     ----------
     frame : Frame
         Silhouettes and projections.
-    pads : (C, 3) float64
-        40 u B_x, 40 u B_y and 40 u B_z of each camera, cameras as in the frame.
+    pads : (C, 4) float64
+        40 u B_x, 40 u B_y and 40 u B_z of each camera, cameras as in the frame, and the depth in
+        metres from which on a cube's rectangle is made of its projection.
     offset_local : (3,) float64
         From the cells' frame to the local frame of the views, metres; the axes are parallel.
     """
@@ -67,74 +69,22 @@ class CellFrame(NamedTuple):
     offset_local: NDArray[np.float64]
 
 
-def make_cell_frame(hull: Hull, origin_world: NDArray[np.float64], reach_m: float) -> CellFrame:
+def make_cell_frame(
+    hull: Hull, origin_world: NDArray[np.float64], reach_m: float, near_m: float = 0.0
+) -> CellFrame:
     """Return the hull of a frame as cells within `reach_m` of `origin_world`, their origin, ask it.
 
-    `reach_m` bounds each coordinate of any corner of a cell.
+    `reach_m` bounds each coordinate of any corner of a cell. A cube nearer than `near_m` to a
+    camera's own plane is not projected: its rectangle would be most of the image, and the planes
+    through the image's borders tell more.
     """
-    frame = make_frame(hull)
+    frame = hull.frame
     offset_local = origin_world - hull.views.origin_world
     matrices = np.abs(frame.matrices.reshape(-1, 3, 4))
     largest = matrices[:, :, :3] @ (np.abs(offset_local) + reach_m) + matrices[:, :, 3]
-    return CellFrame(frame, _PAD * largest, offset_local)
-
-
-@compiled
-def is_inside(
-    x: float,
-    y: float,
-    z: float,
-    matrices: NDArray[np.float64],
-    sizes: NDArray[np.int64],
-    answers: NDArray[np.uint8],
-    mask_offset: NDArray[np.int64],
-    keep: bool,
-    min_cameras: int,
-) -> bool:
-    """Tell whether a point, local frame, is in the hull and clear of all edges of pixels."""
-    n_seen = ZERO
-    for camera in range(len(matrices)):
-        m = matrices[camera]
-        depth_m = m[8] * x + m[9] * y + m[10] * z + m[11]
-        if depth_m > 0:
-            width, height = sizes[camera, 0], sizes[camera, 1]
-            pixel_x = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth_m
-            pixel_y = (m[4] * x + m[5] * y + m[6] * z + m[7]) / depth_m
-            if -_EDGE_PX < pixel_x < width + _EDGE_PX and -_EDGE_PX < pixel_y < height + _EDGE_PX:
-                column, row = int(pixel_x), int(pixel_y)
-                if (
-                    not _EDGE_PX < pixel_x - column < 1.0 - _EDGE_PX
-                    or not _EDGE_PX < pixel_y - row < 1.0 - _EDGE_PX
-                ):
-                    return False
-                answer = answers[mask_offset[camera] + row * width + column]
-                if answer == BACKGROUND:
-                    return False
-                n_seen += answer == OBJECT
-                continue
-        if not keep:
-            return False
-    return not keep or n_seen >= min_cameras
-
-
-@compiled
-def are_inside(points: NDArray[np.float64], asked: CellFrame) -> NDArray[np.bool_]:
-    """Tell which points (N, 3), cells' frame, are in the hull and clear of all edges of pixels."""
-    frame, offset = asked.frame, asked.offset_local
-    inside = np.zeros(len(points), np.bool_)
-    for i in range(len(points)):
-        inside[i] = is_inside(
-            points[i, 0] + offset[0],
-            points[i, 1] + offset[1],
-            points[i, 2] + offset[2],
-            frame.matrices,
-            frame.sizes,
-            frame.answers,
-            frame.mask_offset,
-            frame.keep,
-            frame.min_cameras,
-        )
-    return inside
+    pads = _PAD * largest
+    nearest_m = np.maximum(pads[:, 2:] * (_NEAR / _PAD) + _SMALLEST_NEAR_M, near_m)
+    return CellFrame(frame, np.concatenate([pads, nearest_m], axis=1), offset_local)
 
 
 @compiled
@@ -174,6 +124,150 @@ def _is_beside(
     return False
 
 
+@inlined
+def _cube_bounds(
+    x: float,
+    y: float,
+    z: float,
+    half_m: float,
+    m: NDArray[np.float64],
+    pad_x: float,
+    pad_y: float,
+    pad_z: float,
+) -> tuple[float, float, float, float]:
+    """Return left, right, top and bottom, in pixels, of what a cube before a camera projects into.
+
+    See this file's head.
+    """
+    depth_m, pixel_x, pixel_y = project(x, y, z, m)
+    scale = 1.0 / (depth_m - half_m * (abs(m[8]) + abs(m[9]) + abs(m[10])))
+    around_x = scale * (
+        half_m
+        * (abs(m[0] - pixel_x * m[8]) + abs(m[1] - pixel_x * m[9]) + abs(m[2] - pixel_x * m[10]))
+        + pad_x
+        + abs(pixel_x) * pad_z
+    )
+    around_y = scale * (
+        half_m
+        * (abs(m[4] - pixel_y * m[8]) + abs(m[5] - pixel_y * m[9]) + abs(m[6] - pixel_y * m[10]))
+        + pad_y
+        + abs(pixel_y) * pad_z
+    )
+    return pixel_x - around_x, pixel_x + around_x, pixel_y - around_y, pixel_y + around_y
+
+
+@inlined
+def cube_verdict(
+    x: float,
+    y: float,
+    z: float,
+    half_m: float,
+    matrices: NDArray[np.float64],
+    pads: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    integrals: NDArray[np.int32],
+    integral_offset: NDArray[np.int64],
+    recorded: NDArray[np.int64] | None,
+    keep: bool,
+    min_cameras: int,
+) -> int:
+    """Return what is proved of a cube about a point, local frame: `FREE`, `FULL` or `OPEN`."""
+    n_accept, n_open, n_withheld = 0, 0, 0
+    for camera in range(len(matrices)):
+        m = matrices[camera]
+        width, height, near_m = sizes[camera, 0], sizes[camera, 1], pads[camera, 3]
+        depth_m = m[8] * x + m[9] * y + m[10] * z + m[11]
+        thick_m = half_m * (abs(m[8]) + abs(m[9]) + abs(m[10]))
+        low_x, high_x, low_y, high_y = -1.0, float(width), -1.0, float(height)
+        if depth_m - thick_m >= near_m:
+            low_x, high_x, low_y, high_y = _cube_bounds(
+                x, y, z, half_m, m, pads[camera, 0], pads[camera, 1], pads[camera, 2]
+            )
+        elif depth_m + thick_m <= -near_m or _is_beside(
+            x, y, z, half_m, m, pads[camera], width, height
+        ):
+            if keep:
+                continue
+            return FREE
+        first_x, last_x = pixel_range(low_x, high_x, width, ZERO)
+        first_y, last_y = pixel_range(low_y, high_y, height, ZERO)
+        vote = rectangle_vote(
+            first_x,
+            last_x,
+            first_y,
+            last_y,
+            width,
+            height,
+            integral_offset[camera],
+            integrals,
+            keep,
+            camera,
+            recorded,
+        )
+        if vote == REJECTS:
+            return FREE
+        n_accept += vote == ACCEPTS
+        n_open += vote == UNDECIDED
+        n_withheld += vote == WITHHOLDS
+    if keep and n_accept + n_open < min_cameras:
+        return FREE
+    return FULL if n_open + n_withheld == 0 else OPEN
+
+
+@compiled
+def cube_verdicts(center: NDArray[np.float64], half_m: float, asked: CellFrame) -> NDArray[np.int8]:
+    """Return what is proved of cubes about points (N, 3), cells' frame: `FREE`, `FULL`, `OPEN`."""
+    frame, pads = asked.frame, asked.pads
+    offset_x, offset_y, offset_z = asked.offset_local
+    matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
+    integral_offset, recorded = frame.integral_offset, frame.recorded
+    keep, min_cameras = frame.keep, frame.min_cameras
+    verdicts = np.zeros(len(center), np.int8)
+    for i in range(len(center)):
+        verdicts[i] = cube_verdict(
+            center[i, 0] + offset_x,
+            center[i, 1] + offset_y,
+            center[i, 2] + offset_z,
+            half_m,
+            matrices,
+            pads,
+            sizes,
+            integrals,
+            integral_offset,
+            recorded,
+            keep,
+            min_cameras,
+        )
+    return verdicts
+
+
+@compiled
+def cube_bounds(
+    center: NDArray[np.float64], half_m: float, camera: int, asked: CellFrame
+) -> NDArray[np.float64]:
+    """Return left, right, top and bottom (N, 4), pixels, of what cubes project into in a camera.
+
+    The camera is numbered as in the frame. Of a cube that is cut by the camera's own plane these
+    are all numbers; behind it, right is left of left.
+    """
+    m, pads, offset = asked.frame.matrices[camera], asked.pads, asked.offset_local
+    thick_m = half_m * (abs(m[8]) + abs(m[9]) + abs(m[10]))
+    bounds_px = np.zeros((len(center), 4))
+    for i in range(len(center)):
+        x, y, z = center[i, 0] + offset[0], center[i, 1] + offset[1], center[i, 2] + offset[2]
+        depth_m = m[8] * x + m[9] * y + m[10] * z + m[11]
+        low_x, high_x, low_y, high_y = -np.inf, np.inf, -np.inf, np.inf
+        if depth_m - thick_m >= pads[camera, 3]:
+            low_x, high_x, low_y, high_y = _cube_bounds(
+                x, y, z, half_m, m, pads[camera, 0], pads[camera, 1], pads[camera, 2]
+            )
+        elif depth_m + thick_m <= -pads[camera, 3]:
+            low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
+        bounds_px[i, 0], bounds_px[i, 1] = low_x, high_x
+        bounds_px[i, 2], bounds_px[i, 3] = low_y, high_y
+    return bounds_px
+
+
 @compiled
 def split_cells(
     center: NDArray[np.float64], half_m: float, asked: CellFrame
@@ -202,7 +296,7 @@ def split_cells(
     offset_x, offset_y, offset_z = asked.offset_local
     matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
     answers, mask_offset = frame.answers, frame.mask_offset
-    integral_offset = frame.integral_offset
+    integral_offset, recorded, every = frame.integral_offset, frame.recorded, frame.every
     keep, min_cameras, n_cameras = frame.keep, frame.min_cameras, len(frame.matrices)
     whole = np.zeros(8 * len(center), np.int64)
     part_center = np.zeros((8 * len(center), 3))
@@ -214,80 +308,40 @@ def split_cells(
             cell_y = center[i, 1] + (half_m if octant & 2 else -half_m)
             cell_z = center[i, 2] + (half_m if octant & 4 else -half_m)
             x, y, z = cell_x + offset_x, cell_y + offset_y, cell_z + offset_z
-            is_free, n_accept, n_left = False, 0, 0
-            for camera in range(n_cameras):
-                m = matrices[camera]
-                width, height = sizes[camera, 0], sizes[camera, 1]
-                depth_m = m[8] * x + m[9] * y + m[10] * z + m[11]
-                thick_m = half_m * (abs(m[8]) + abs(m[9]) + abs(m[10]))
-                near_m = pads[camera, 2] * (_NEAR / _PAD) + 1e-30
-                if depth_m + thick_m <= -near_m:  # behind: never seen
-                    if keep:
-                        continue
-                    is_free = True
-                    break
-                if depth_m - thick_m >= near_m:
-                    scale = 1.0 / (depth_m - thick_m)
-                    pixel_x = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth_m
-                    pixel_y = (m[4] * x + m[5] * y + m[6] * z + m[7]) / depth_m
-                    around_x = scale * (
-                        half_m
-                        * (
-                            abs(m[0] - pixel_x * m[8])
-                            + abs(m[1] - pixel_x * m[9])
-                            + abs(m[2] - pixel_x * m[10])
-                        )
-                        + pads[camera, 0]
-                        + abs(pixel_x) * pads[camera, 2]
-                    )
-                    around_y = scale * (
-                        half_m
-                        * (
-                            abs(m[4] - pixel_y * m[8])
-                            + abs(m[5] - pixel_y * m[9])
-                            + abs(m[6] - pixel_y * m[10])
-                        )
-                        + pads[camera, 1]
-                        + abs(pixel_y) * pads[camera, 2]
-                    )
-                    low_x, high_x = pixel_x - around_x, pixel_x + around_x
-                    low_y, high_y = pixel_y - around_y, pixel_y + around_y
-                elif _is_beside(x, y, z, half_m, m, pads[camera], width, height):
-                    if keep:
-                        continue
-                    is_free = True
-                    break
-                else:
-                    low_x, low_y = -1.0, -1.0
-                    high_x, high_y = float(width), float(height)
-                vote = rectangle_vote(
-                    np.int64(np.floor(min(max(low_x, -1.0), width))),
-                    np.int64(np.floor(min(max(high_x, -1.0), width))),
-                    np.int64(np.floor(min(max(low_y, -1.0), height))),
-                    np.int64(np.floor(min(max(high_y, -1.0), height))),
-                    width,
-                    height,
-                    integral_offset[camera],
-                    integrals,
-                    keep,
-                    camera,
-                    frame.recorded,
-                )
-                if vote == REJECTS:
-                    is_free = True
-                    break
-                if vote == ACCEPTS:
-                    n_accept += 1
-                elif vote == UNDECIDED:
-                    n_left += 1
-            if is_free or (keep and n_accept + n_left < min_cameras):
+            verdict = cube_verdict(
+                x,
+                y,
+                z,
+                half_m,
+                matrices,
+                pads,
+                sizes,
+                integrals,
+                integral_offset,
+                recorded,
+                keep,
+                min_cameras,
+            )
+            if verdict == FREE:
                 continue
             whole[n_parts] = i
             part_center[n_parts, 0] = cell_x
             part_center[n_parts, 1] = cell_y
             part_center[n_parts, 2] = cell_z
             inside[n_parts] = is_inside(
-                x, y, z, matrices, sizes, answers, mask_offset, keep, min_cameras
+                x,
+                y,
+                z,
+                every,
+                n_cameras,
+                ZERO,
+                matrices,
+                sizes,
+                answers,
+                mask_offset,
+                keep,
+                min_cameras,
+                EDGE_PX,
             )
             n_parts += 1
     return whole[:n_parts], part_center[:n_parts], inside[:n_parts]

@@ -39,23 +39,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
-from hybridve.hull.query.clusters import make_frame, make_shares
+from hybridve.hull.query.boxes import ABSTAINS, ACCEPTS, REJECTS, WITHHOLDS, rectangle_vote
+from hybridve.hull.query.clusters import make_shares
 from hybridve.hull.query.engine import Closing, Triangles
+from hybridve.hull.query.frame import Frame
+from hybridve.hull.query.points import is_inside
 from hybridve.hull.query.rectangles import (
-    ABSTAINS,
-    ACCEPTS,
-    REJECTS,
-    WITHHOLDS,
-    Frame,
     Surface,
     Tree,
     load_corners,
-    rectangle_vote,
     survivors,
     triangle_rectangles,
 )
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, Hull
+from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.threads import Threads
 
 #: Verdicts.
@@ -178,7 +175,7 @@ class Certifier(Closing):
         return MeshCertificate(OPEN, nowhere, float(open_m.max()) / LEAF_EDGE)
 
     def _parts(self, hull: Hull, mesh: Triangles, *, is_any: bool) -> list[_Part]:
-        frame = make_frame(hull)
+        frame = hull.frame
         # The number of the first share that has found a witness: those after it need not look on.
         found = np.full(1, np.iinfo(np.int64).max)
         asked = (LEAF_EDGE * self.open_at_m, MOST_CELLS, is_any, found)
@@ -197,42 +194,6 @@ def certify_triangles(hull: Hull, mesh: Triangles, open_at_m: float) -> Certific
     """Return what is certain about each triangle of a mesh; `Certifier` keeps its threads."""
     with Certifier(open_at_m) as certifier:
         return certifier.certify(hull, mesh)
-
-
-@compiled
-def _is_inside(
-    x: float,
-    y: float,
-    z: float,
-    cameras: NDArray[np.int64],
-    n_cameras: int,
-    n_accept: int,
-    matrices: NDArray[np.float64],
-    sizes: NDArray[np.int64],
-    answers: NDArray[np.uint8],
-    mask_offset: NDArray[np.int64],
-    keep: bool,
-    min_cameras: int,
-) -> bool:
-    """Tell whether a point is in the hull, asked of the cameras that are undecided."""
-    n_seen = n_accept
-    for number in range(n_cameras):
-        camera = cameras[number]
-        width, height = sizes[camera, 0], sizes[camera, 1]
-        m = matrices[camera]
-        depth_m = m[8] * x + m[9] * y + m[10] * z + m[11]
-        if depth_m > 0:
-            pixel_x = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth_m
-            pixel_y = (m[4] * x + m[5] * y + m[6] * z + m[7]) / depth_m
-            if 0 <= pixel_x < width and 0 <= pixel_y < height:
-                answer = answers[mask_offset[camera] + int(pixel_y) * width + int(pixel_x)]
-                if answer == BACKGROUND:
-                    return False
-                n_seen += answer == OBJECT
-                continue
-        if not keep:
-            return False
-    return not keep or n_seen >= min_cameras
 
 
 @compiled
@@ -323,7 +284,7 @@ def _certify_triangle(
         x = (cell[0] + cell[3] + cell[6]) / 3.0
         y = (cell[1] + cell[4] + cell[7]) / 3.0
         z = (cell[2] + cell[5] + cell[8]) / 3.0
-        if _is_inside(
+        if is_inside(
             x,
             y,
             z,
@@ -336,6 +297,7 @@ def _certify_triangle(
             mask_offset,
             keep,
             min_cameras,
+            0.0,  # the specification is asked about edges of pixels
         ):
             witness[0], witness[1], witness[2] = x, y, z
             return COLLIDING, 0.0

@@ -9,7 +9,7 @@ Nothing in it depends on the silhouettes: it serves as long as mesh and cameras 
 import itertools
 import weakref
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from hybridve.hull.jit import compiled
 from hybridve.hull.query.bounds import ROUNDOFF_FLOAT64, rectangle_pads
 from hybridve.hull.query.engine import Triangles
+from hybridve.hull.query.frame import Frame
 from hybridve.hull.query.rectangles import (
     BATCH,
     BRANCH,
     CLUSTER,
-    Frame,
     Surface,
     Tree,
     cluster_rectangles,
@@ -97,34 +97,6 @@ def _spread(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
     ):
         number = (number | number << np.uint64(shift)) & np.uint64(mask)
     return number
-
-
-def make_frame(hull: Hull) -> Frame:
-    """Return a hull as compiled loops take it.
-
-    The camera that sees the smallest silhouette rejects most: it is asked first.
-    """
-    views = hull.views
-    order = np.argsort(hull.object_shares(), kind="stable")
-    return Frame(
-        views.img_from_local.reshape(-1, 12)[order],
-        views.sizes_px[order],
-        _read_only(hull.answers_flat),
-        hull.mask_offset[order],
-        _read_only(hull.integrals_flat),
-        hull.integral_offset[order],
-        None if views.seen is None else hull.recorded_offset[order],
-        order,
-        views.unseen == "keep",
-        views.min_cameras,
-    )
-
-
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a view that cannot be written to, so that one compiled version takes every array."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 class Share(NamedTuple):

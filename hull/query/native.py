@@ -17,21 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled, inlined
-from hybridve.hull.query.clusters import make_frame, make_shares
-from hybridve.hull.query.engine import Closing, Hits, Triangles
-from hybridve.hull.query.rectangles import (
+from hybridve.hull.query.boxes import (
     ABSTAINS,
     ACCEPTS,
     REJECTS,
     UNDECIDED,
     WITHHOLDS,
-    Frame,
-    Surface,
-    Tree,
-    load_corners,
+    pixel_range,
     rectangle_vote,
-    survivors,
 )
+from hybridve.hull.query.clusters import make_shares
+from hybridve.hull.query.engine import Closing, Hits, Triangles
+from hybridve.hull.query.frame import Frame
+from hybridve.hull.query.points import pixel_of
+from hybridve.hull.query.rectangles import Surface, Tree, load_corners, survivors
 from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, Hull
 from hybridve.hull.query.threads import Threads
 from hybridve.hull.query.viewport import n_samples, sample_steps
@@ -168,11 +167,13 @@ def _tile_vote(
     else:
         low_x, high_x = -1.0, -1.0 if depth_max_m <= -near_m else width
         low_y, high_y = -1.0, height
+    first_x, last_x = pixel_range(low_x, high_x, width_px, ZERO)
+    first_y, last_y = pixel_range(low_y, high_y, height_px, ZERO)
     return rectangle_vote(
-        int(np.floor(min(max(low_x, -1.0), width))),
-        int(np.floor(min(max(high_x, -1.0), width))),
-        int(np.floor(min(max(low_y, -1.0), height))),
-        int(np.floor(min(max(high_y, -1.0), height))),
+        first_x,
+        last_x,
+        first_y,
+        last_y,
         width_px,
         height_px,
         first,
@@ -208,9 +209,7 @@ def _sample_tile(
             n_seen[place] = n_accept
     for number in range(n_cameras):
         camera = cameras[number]
-        width = sizes[camera, 0]
-        right, bottom = float(width), float(sizes[camera, 1])
-        first = mask_offset[camera]
+        width, height, first = sizes[camera, 0], sizes[camera, 1], mask_offset[camera]
         for dj in range(min(rest, 7) + 1):
             j = float(j0 + dj)
             x0, y0, z0 = (
@@ -229,9 +228,9 @@ def _sample_tile(
                     (x0 + i * steps[camera, 3]) * per_depth,
                     (y0 + i * steps[camera, 4]) * per_depth,
                 )
-                seen = depth_m > 0 and 0 <= pixel_x < right and 0 <= pixel_y < bottom
-                if seen:
-                    answer = answers[first + int(pixel_y) * width + int(pixel_x)]
+                pixel = pixel_of(depth_m, pixel_x, pixel_y, width, height, first)
+                if pixel >= 0:
+                    answer = answers[pixel]
                     if keep:
                         n_seen[8 * dj + di] += answer == OBJECT
                     if answer == BACKGROUND:
@@ -387,8 +386,7 @@ def _sample_all(
         n_seen[sample] = n_accept
     for number in range(n_cameras):
         camera = cameras[number]
-        width, first = sizes[camera, 0], mask_offset[camera]
-        right, bottom = float(width), float(sizes[camera, 1])
+        width, height, first = sizes[camera, 0], sizes[camera, 1], mask_offset[camera]
         a_x, a_y, a_z = steps[camera, 0], steps[camera, 1], steps[camera, 2]
         b_x, b_y, b_z = steps[camera, 3], steps[camera, 4], steps[camera, 5]
         c_x, c_y, c_z = steps[camera, 6], steps[camera, 7], steps[camera, 8]
@@ -398,15 +396,7 @@ def _sample_all(
             per_depth = 1.0 / depth_m
             pixel_x = (a_x + j * c_x + i * b_x) * per_depth
             pixel_y = (a_y + j * c_y + i * b_y) * per_depth
-            seen = (
-                (depth_m > 0)
-                & (pixel_x >= 0)
-                & (pixel_x < right)
-                & (pixel_y >= 0)
-                & (pixel_y < bottom)
-            )
-            column, row = pixel_x if seen else 0.0, pixel_y if seen else 0.0
-            pixels[sample] = first + np.int64(row) * width + np.int64(column) if seen else -1
+            pixels[sample] = pixel_of(depth_m, pixel_x, pixel_y, width, height, first)
         for sample in range(n_samples):
             pixel = pixels[sample]
             if pixel >= 0:
@@ -544,7 +534,7 @@ class Native(Closing):
 
     def query(self, hull: Hull, meshes: list[Triangles]) -> list[Hits]:
         """Return for each mesh its samples inside the hull of this frame."""
-        frame = make_frame(hull)
+        frame = hull.frame
         calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         ends = [0]
         for mesh in meshes:

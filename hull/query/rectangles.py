@@ -16,50 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.jit import ZERO, compiled
-
-#: What one camera's rectangle proves: no sample inside, all on object pixels, none seen, nothing,
-#: none seen on an object pixel (of a camera that may abstain; it may still reject some).
-REJECTS, ACCEPTS, ABSTAINS, UNDECIDED, WITHHOLDS = 0, 1, 2, 3, 4
+from hybridve.hull.query.boxes import (
+    ABSTAINS,
+    ACCEPTS,
+    REJECTS,
+    UNDECIDED,
+    WITHHOLDS,
+    rectangle_vote,
+)
+from hybridve.hull.query.frame import Frame
 
 #: Triangles whose rectangles are computed together: their corners stay in the first cache.
 BATCH = 256
 
 #: Triangles of a cluster, and clusters (or groups) of a group.
 CLUSTER, BRANCH = 16, 4
-
-
-class Frame(NamedTuple):
-    """The hull of one frame as compiled loops take it, cameras in the order they are asked.
-
-    Attributes
-    ----------
-    matrices : (C, 12) float64
-        Projections in pixels from metres, local frame, row-major.
-    sizes : (C, 2) int64
-        Width and height.
-    answers, mask_offset, integrals, integral_offset
-        As in `hybridve.hull.query.silhouettes.Hull`.
-    recorded : (C,) int64 or None
-        `hybridve.hull.query.silhouettes.Hull.recorded_offset`; None where all cameras recorded all
-        of their images. That is another type, so that the loops for them are compiled without.
-    order : (C,) int64
-        The number of each camera in the views.
-    keep : bool
-        Whether a camera that cannot see a point abstains.
-    min_cameras : int
-        How many must see it then.
-    """
-
-    matrices: NDArray[np.float64]
-    sizes: NDArray[np.int64]
-    answers: NDArray[np.uint8]
-    mask_offset: NDArray[np.int64]
-    integrals: NDArray[np.int32]
-    integral_offset: NDArray[np.int64]
-    recorded: NDArray[np.int64] | None
-    order: NDArray[np.int64]
-    keep: bool
-    min_cameras: int
 
 
 class Surface(NamedTuple):
@@ -94,57 +65,6 @@ class Tree(NamedTuple):
 
     rectangles: NDArray[np.int32]
     level_start: NDArray[np.int64]
-
-
-@compiled  # for 64-bit pixels only: callers convert, lest it be compiled twice
-def rectangle_vote(
-    first_x: int | np.int64,
-    last_x: int | np.int64,
-    first_y: int | np.int64,
-    last_y: int | np.int64,
-    width: int,
-    height: int,
-    first: int,
-    integrals: NDArray[np.int32],
-    keep: bool,
-    camera: int,
-    recorded: NDArray[np.int64] | None,
-) -> int:
-    """Return what a rectangle of pixels, clamped to -1..size, proves in one camera.
-
-    Its image is width x height pixels, its integral image begins at `first`, and that of what it
-    recorded where `recorded` says of it.
-    """
-    x0, x1 = max(first_x, 0), min(last_x + 1, width)
-    y0, y1 = max(first_y, 0), min(last_y + 1, height)
-    if x1 <= x0 or y1 <= y0:
-        return ABSTAINS if keep else REJECTS
-    wholly_seen = first_x >= 0 and first_y >= 0 and last_x < width and last_y < height
-    above, below = first + y0 * (width + 1), first + y1 * (width + 1)
-    count = (
-        integrals[below + x1]
-        - integrals[above + x1]
-        - integrals[below + x0]
-        + integrals[above + x0]
-    )
-    if recorded is not None:  # not compiled where it is
-        start = recorded[camera]
-        if start >= 0:
-            above, below = start + y0 * (width + 1), start + y1 * (width + 1)
-            n_seen = (
-                integrals[below + x1]
-                - integrals[above + x1]
-                - integrals[below + x0]
-                + integrals[above + x0]
-            )
-            if n_seen == 0:
-                return ABSTAINS
-            wholly_seen = wholly_seen and n_seen == (x1 - x0) * (y1 - y0)
-    if count == 0:
-        return REJECTS if wholly_seen or not keep else WITHHOLDS
-    if wholly_seen and count == (x1 - x0) * (y1 - y0):
-        return ACCEPTS
-    return UNDECIDED
 
 
 @compiled
@@ -332,9 +252,7 @@ def _node_verdict(
 def open_nodes(level: int, tree: Tree, frame: Frame) -> NDArray[np.int64]:
     """Return the nodes of a level that are not proved free, counted within it, ascending."""
     n_cameras = len(frame.matrices)
-    cameras, left = np.zeros(n_cameras, np.int64), np.zeros(n_cameras, np.int64)
-    for camera in range(n_cameras):
-        cameras[camera] = camera
+    left = np.zeros(n_cameras, np.int64)
     top = len(tree.level_start) - 2
     nodes = np.zeros(tree.level_start[top + 1] - tree.level_start[top], np.int64)
     for number in range(len(nodes)):
@@ -351,7 +269,7 @@ def open_nodes(level: int, tree: Tree, frame: Frame) -> NDArray[np.int64]:
                 frame.recorded,
                 frame.keep,
                 frame.min_cameras,
-                cameras,
+                frame.every,
                 n_cameras,
                 ZERO,
                 left,

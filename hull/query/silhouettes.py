@@ -14,7 +14,7 @@ background to a camera that carves, and nothing to one that abstains.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.pose import nearest_to_axes
+from hybridve.hull.query.frame import Frame
 
 Unseen = Literal["carve", "keep"]
 
@@ -115,9 +116,10 @@ def make_seen(
                 f"what camera {names[camera]} saw has shape {mask.shape}, "
                 f"expected {(height, width)}"
             )
-        if (mask != 0).all():
+        is_seen = mask != 0
+        if is_seen.all():
             continue
-        seen = np.asarray(mask != 0).view(np.uint8)
+        seen = is_seen.view(np.uint8)
         mask_offset[camera] = sum(map(len, flat))
         integral_offset[camera] = sum(map(len, integrals))
         flat.append(seen.ravel())
@@ -164,6 +166,20 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def project(self, points_world: NDArray[np.float64], camera: int) -> NDArray[np.float64]:
+        """Return the homogeneous pixels (..., 3) of points (..., 3), metres, in one camera.
+
+        The third coordinate is the depth in metres; divided by it, the others are a pixel where
+        it is above 0.
+        """
+        matrix = self.img_from_local[camera]
+        projected = (points_world - self.origin_world) @ matrix[:, :3].T + matrix[:, 3]
+        return np.asarray(projected, np.float64)
+
+    def centers_local(self) -> NDArray[np.float64]:
+        """Return where the cameras stand, (C, 3) metres."""
+        return _centers(self.img_from_local)
 
     def seen_mask(self, camera: int) -> NDArray[np.uint8] | None:
         """Return the (H, W) mask of what a camera recorded, 1 there; None for all its image."""
@@ -329,7 +345,8 @@ class Hull:
     """The visual hull of one frame.
 
     Build it with `make_hull`. The images of all cameras lie in one flat buffer each, camera after
-    camera, so that compiled code and graphics memory take them as they are.
+    camera, so that compiled code and graphics memory take them as they are. They cannot be written
+    to.
 
     Attributes
     ----------
@@ -358,6 +375,33 @@ class Hull:
     integrals_flat: NDArray[np.int32]
     integral_offset: NDArray[np.int64]
     recorded_offset: NDArray[np.int64]
+    _frame: Frame | None = field(default=None, init=False, repr=False)
+
+    @property
+    def frame(self) -> Frame:
+        """The hull as compiled loops take it, made when it is first asked for.
+
+        The camera that sees the smallest silhouette rejects most: it is asked first.
+        """
+        if self._frame is None:  # threads that meet here make the same one
+            views = self.views
+            order = np.argsort(self.object_shares(), kind="stable")
+            made = Frame(
+                views.img_from_local.reshape(-1, 12)[order],
+                views.sizes_px[order],
+                self.answers_flat,
+                self.mask_offset[order],
+                self.integrals_flat,
+                self.integral_offset[order],
+                None if views.seen is None else self.recorded_offset[order],
+                order,
+                np.arange(len(views)),
+                views.unseen == "keep",
+                views.min_cameras,
+            )
+            object.__setattr__(self, "_frame", made)
+            return made
+        return self._frame
 
     def mask(self, camera: int) -> NDArray[np.uint8]:
         """Return the (H, W) silhouette of one camera, 1 on object pixels."""
@@ -439,8 +483,12 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
                 answers[:] = target
             else:
                 np.bitwise_and(target, seen, out=target)
-                np.add(target, np.uint8(UNSEEN) * (np.uint8(1) - seen), out=answers)
+                np.subtract(np.uint8(1), seen, out=answers)
+                np.multiply(answers, np.uint8(UNSEEN), out=answers)
+                np.add(answers, target, out=answers)
         cv2.integral(target, sum=hull.integral(camera), sdepth=cv2.CV_32S)
+    for images in (hull.masks_flat, hull.answers_flat, hull.integrals_flat):
+        images.flags.writeable = False
     return hull
 
 

@@ -250,7 +250,7 @@ def silhouette_normal(
     nowhere = np.full(3, np.nan)
     views = hull.views
     matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    projected = views.project(point_world, camera)
     width, height = views.sizes_px[camera].tolist()
     if not projected[2] > 0:
         return nowhere

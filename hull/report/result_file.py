@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 
 #: How every dataset of a result is stored.
 STORED = {
@@ -27,15 +28,11 @@ def writing(path: Path) -> Iterator[h5py.File]:
     ReportError
         If it cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
     try:
-        with h5py.File(partial, "w") as file:
+        with appearing(path) as partial, h5py.File(partial, "w") as file:
             yield file
-        partial.replace(path)
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @contextmanager

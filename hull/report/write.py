@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 from hybridve.hull.contact.finding import Finding
 from hybridve.hull.report.collisions import Runs, StoredMesh
-from hybridve.hull.report.result_file import STORED
+from hybridve.hull.report.result_file import STORED, writing
 from hybridve.hull.report.schema import (
     CAMERA_COLUMNS,
     FORMAT,
@@ -141,10 +142,8 @@ class ReportWriter:
         started = time.perf_counter()
         columns = _columns(self._pending, self._header)
         part = self._parts / f"{self.n_done:09d}.npz"
-        partial = part.with_suffix(".partial")
-        with partial.open("wb") as file:
+        with appearing(part) as partial, partial.open("wb") as file:
             np.savez(file, **columns)  # type: ignore[arg-type]  # the stub takes the names for options
-        partial.replace(part)
         self.n_done += len(self._pending)
         self._pending, self._n_pending_runs = [], 0
         self._write_s += time.perf_counter() - started
@@ -166,14 +165,8 @@ class ReportWriter:
     def finish(self) -> None:
         """Make the parts the report."""
         self._flush()
-        partial = self._path.with_name(self._path.name + ".partial")
-        try:
-            with h5py.File(partial, "w") as file:
-                self._write(file)
-            partial.replace(self._path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise ReportError(f"{self._path}: cannot be written: {error}") from error
+        with writing(self._path) as file:
+            self._write(file)
         shutil.rmtree(self._parts)
 
     def _write(self, file: h5py.File) -> None:

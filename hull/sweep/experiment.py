@@ -7,40 +7,36 @@ grows slower meanwhile is slower for all alike. A hull is a new one each time it
 recording, so that its upload counts.
 """
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import DeviceError
-from hybridve.hull.cad.scene import SceneObject
-from hybridve.hull.contact.detect import Body, collision_points, make_body
-from hybridve.hull.query.engine import Engine, Hits
+from hybridve.hull.contact.detect import Body, collision_points
+from hybridve.hull.query.engine import Engine
 from hybridve.hull.report.sweep_file import EngineSweep, SweepFrames, SweepRows, TruthSettings
 from hybridve.hull.sweep.cost import fit_cost, window_px_read
 from hybridve.hull.sweep.frames import HullFrame
 from hybridve.hull.sweep.front import pareto_front
+from hybridve.hull.sweep.judgement import (
+    Judgement,
+    Row,
+    Truth,
+    answer_of,
+    find_truth,
+    judge_all,
+    largest,
+    predicted_m,
+)
 from hybridve.hull.sweep.room import EngineRoom
 from hybridve.hull.sweep.truth import (
     COLLIDING,
-    FINER,
-    FREE,
     OPEN,
-    BodyTruth,
     Certify,
-    affordable_spacing,
-    certify_body,
-    dense_mesh,
-    longest_edges,
-    nearest_distances,
-    sample_body,
 )
-
-#: Points of the truth kept of one object in one frame, beside the witnesses.
-TRUTH_POINTS = 50_000
 
 #: By how much a distance may exceed the accuracy predicted: reported points are stored in single
 #: precision, 1e-7 of some metres.
@@ -48,25 +44,6 @@ _ROUNDING_M = 1e-6
 
 #: Tells the time in seconds.
 Clock = Callable[[], float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Row:
-    """One way to lay the scene into viewports.
-
-    Attributes
-    ----------
-    viewport : int
-        Samples along every edge; 0 where `accuracy_m` gives each triangle its own.
-    accuracy_m : float
-        The largest spacing of samples along an edge; NaN where `viewport` is given.
-    bodies : list of Body
-        The objects.
-    """
-
-    viewport: int
-    accuracy_m: float
-    bodies: list[Body]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,37 +57,6 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Truth:
-    """The truth of all frames, per frame a `BodyTruth` of each body that is near."""
-
-    frames: list[dict[int, BodyTruth]]
-    settings: TruthSettings
-    certify_s: NDArray[np.float64]
-    sample_s: NDArray[np.float64]
-    near_triangles: list[NDArray[np.bool_]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Judgement:
-    """What one engine's answer to one row is worth, over all frames.
-
-    The last two are the distances of the truth's witnesses and of its dense samples.
-    """
-
-    n_points: int
-    triangles_missed: int
-    objects_missed: int
-    triangles_against_proof: int
-    witness_m: NDArray[np.float64]
-    dense_m: NDArray[np.float64]
-
-    @property
-    def distances_m(self) -> NDArray[np.float64]:
-        """Of all true points to the nearest reported ones."""
-        return np.concatenate([self.witness_m, self.dense_m])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Work:
     """What the cost model counts, a frame: n m; per row n m u^2 / 2 and the stencil's windows."""
 
@@ -118,35 +64,6 @@ class _Work:
     fill_px: NDArray[np.float64]
     window_px: NDArray[np.float64]
     is_uniform: NDArray[np.bool_]
-
-
-def make_rows(
-    objects: Sequence[SceneObject], viewports: Sequence[int], accuracy_m: float
-) -> list[Row]:
-    """Return a row for each viewport, and last the one of an accuracy.
-
-    Raises
-    ------
-    ValueError
-        If the accuracy needs a viewport too large.
-    """
-    rows = [
-        Row(viewport, np.nan, [make_body(one, viewport=viewport) for one in objects])
-        for viewport in viewports
-    ]
-    chosen = [make_body(one, accuracy_m=accuracy_m) for one in objects]
-    return [*rows, Row(0, accuracy_m, chosen)]
-
-
-def samples_asked(frames: Sequence[HullFrame], rows: Sequence[Row]) -> int:
-    """Return how many samples an engine that rejects nothing looks at to answer all rows once."""
-    return sum(
-        int(body.triangles.topology.samples_before[-1])
-        for frame in frames
-        for row in rows
-        for body, is_near in zip(row.bodies, frame.near, strict=True)
-        if is_near
-    )
 
 
 def run_sweep(
@@ -192,8 +109,8 @@ def run_sweep(
     DeviceError
         If the device of an engine fails.
     """
-    truth = _find_truth(frames, rows, certify, open_at_m, truth_room, advance)
-    rooms, judged = _judge_all(frames, rows, rooms, truth, advance, leave_out)
+    truth = find_truth(frames, rows, certify, open_at_m, truth_room, advance)
+    rooms, judged = judge_all(frames, rows, rooms, truth, advance, leave_out)
     query_s = np.zeros((len(rooms), len(rows), repeats))
     place_s = np.zeros_like(query_s)
     for repeat in range(repeats):
@@ -206,7 +123,7 @@ def run_sweep(
                 )
                 advance()
 
-    largest_m = np.array([[_largest(one.distances_m) for one in row] for row in judged])  # (E, U)
+    largest_m = np.array([[largest(one.distances_m) for one in row] for row in judged])  # (E, U)
     costs = np.column_stack(
         [
             np.median(query_s + place_s, axis=2).ravel(),
@@ -237,136 +154,6 @@ def run_sweep(
     )
 
 
-def _find_truth(
-    frames: Sequence[HullFrame],
-    rows: Sequence[Row],
-    certify: Certify,
-    open_at_m: float,
-    room: EngineRoom,
-    advance: Callable[[], object],
-) -> _Truth:
-    bodies = rows[0].bodies
-    found: list[dict[int, BodyTruth]] = []
-    certify_s, sample_s = np.zeros(len(frames)), np.zeros(len(frames))
-    near_triangles = [np.zeros(len(body.triangles), np.bool_) for body in bodies]
-    for number, frame in enumerate(frames):
-        started = time.perf_counter()
-        found.append(
-            {
-                index: certify_body(frame.hull, bodies[index], certify, open_at_m)
-                for index in np.flatnonzero(frame.near).tolist()
-            }
-        )
-        for index, one in found[-1].items():
-            near_triangles[index] |= one.verdict != FREE
-        certify_s[number] = time.perf_counter() - started
-        advance()
-
-    finest_m = min(_predicted(row, near_triangles) for row in rows)
-    spacing_wanted_m = spacing_m = finest_m / FINER
-    if finest_m > 0:  # neither NaN, where nothing is near, nor 0, where all that is has no size
-        edges_m = np.concatenate(
-            [
-                longest_edges(body.triangles)[near]
-                for body, near in zip(bodies, near_triangles, strict=True)
-            ]
-        )
-        spacing_m = affordable_spacing(edges_m, spacing_wanted_m)
-        dense = [
-            dense_mesh(body.triangles, near, spacing_m)
-            for body, near in zip(bodies, near_triangles, strict=True)
-        ]
-        for number, frame in enumerate(frames):
-            started = time.perf_counter()
-            for index, one in found[number].items():
-                if (one.verdict != FREE).any():
-                    found[number][index] = room.call(
-                        sample_body, frame.hull, one, dense[index], room.engine, TRUTH_POINTS
-                    )
-            sample_s[number] = time.perf_counter() - started
-    open_most_m = max((one.open_at_m for frame in found for one in frame.values()), default=0.0)
-    settings = TruthSettings(open_at_m, open_most_m, spacing_wanted_m, spacing_m, TRUTH_POINTS)
-    return _Truth(found, settings, certify_s, sample_s, near_triangles)
-
-
-def _judge_all(
-    frames: Sequence[HullFrame],
-    rows: Sequence[Row],
-    rooms: Sequence[EngineRoom],
-    truth: _Truth,
-    advance: Callable[[], object],
-    leave_out: Callable[[str, DeviceError], object] | None,
-) -> tuple[list[EngineRoom], list[list[_Judgement]]]:
-    """Return the engines whose devices serve, and what each one's answer to each row is worth."""
-    judged: dict[EngineRoom, list[_Judgement]] = {room: [] for room in rooms}
-    for row in rows:
-        known: dict[bytes, NDArray[np.float64]] = {}
-        for room in list(judged):
-            try:
-                judged[room].append(room.call(_judge_row, room, frames, row, truth.frames, known))
-            except DeviceError as error:
-                if leave_out is None or len(judged) == 1:
-                    raise
-                leave_out(room.engine.name, error)
-                del judged[room]
-            advance()
-    return list(judged), list(judged.values())
-
-
-def _judge_row(
-    room: EngineRoom,
-    frames: Sequence[HullFrame],
-    row: Row,
-    truth: list[dict[int, BodyTruth]],
-    known: dict[bytes, NDArray[np.float64]],
-) -> _Judgement:
-    """Return what an engine's answer to a row is worth.
-
-    Engines mostly agree to the sample: `known` keeps the distances by what was answered.
-    """
-    n_points = triangles_missed = objects_missed = against_proof = 0
-    witness_m, dense_m = [np.zeros(0)], [np.zeros(0)]
-    for number, frame in enumerate(frames):
-        for index, hits in _answer(room, frame, row).items():
-            one = truth[number][index]
-            n_points += len(hits)
-            touched = np.zeros(len(one.verdict), np.bool_)
-            touched[hits.touched()[0]] = True
-            triangles_missed += int((~touched & (one.verdict == COLLIDING)).sum())
-            against_proof += int((touched & (one.verdict == FREE)).sum())
-            if one.collides and len(hits) == 0:
-                objects_missed += 1
-            # Done even where the answer is known already: to warm up.
-            reported_world, _ = collision_points(row.bodies[index], hits)
-            true_world = np.concatenate([one.witnesses_world, one.dense_world])
-            if len(hits) == 0 or len(true_world) == 0:
-                continue
-            key = hashlib.sha256(b"%d %d" % (number, index))
-            key.update(hits.start.tobytes() + hits.stop.tobytes())
-            if key.digest() not in known:
-                known[key.digest()] = nearest_distances(true_world, reported_world)
-            found_m = known[key.digest()]
-            witness_m.append(found_m[: len(one.witnesses_world)])
-            dense_m.append(found_m[len(one.witnesses_world) :])
-    return _Judgement(
-        n_points,
-        triangles_missed,
-        objects_missed,
-        against_proof,
-        np.concatenate(witness_m),
-        np.concatenate(dense_m),
-    )
-
-
-def _answer(room: EngineRoom, frame: HullFrame, row: Row) -> dict[int, Hits]:
-    """Return an engine's hits on the bodies that are near."""
-    room.raise_if_left()
-    near = np.flatnonzero(frame.near).tolist()
-    hull = replace(frame.hull)  # the same arrays, but a hull that no engine has seen
-    hits = room.engine.query(hull, [row.bodies[index].triangles for index in near])
-    return dict(zip(near, hits, strict=True))
-
-
 def _answer_in_time(
     room: EngineRoom, frames: Sequence[HullFrame], row: Row, clock: Clock
 ) -> tuple[float, float]:
@@ -374,7 +161,7 @@ def _answer_in_time(
     query_s = place_s = 0.0
     for frame in frames:
         started = clock()
-        answers = _answer(room, frame, row)
+        answers = answer_of(room, frame, row)
         answered = clock()
         for index, hits in answers.items():
             collision_points(row.bodies[index], hits)
@@ -416,28 +203,15 @@ def _row_columns(rows: Sequence[Row], near_triangles: list[NDArray[np.bool_]]) -
             np.uint64,
         ),
         predicted_m=np.array([max(body.spacing_m for body in row.bodies) for row in rows]),
-        predicted_near_m=np.array([_predicted(row, near_triangles) for row in rows]),
+        predicted_near_m=np.array([predicted_m(row, near_triangles) for row in rows]),
     )
-
-
-def _predicted(row: Row, near_triangles: list[NDArray[np.bool_]]) -> float:
-    """Return the largest edge / (u - 1) of triangles that are near; NaN if there is none."""
-    spacings_m = [
-        (longest_edges(body.triangles) / np.maximum(body.triangles.viewports - 1, 1))[near]
-        for body, near in zip(row.bodies, near_triangles, strict=True)
-    ]
-    return _largest(np.concatenate(spacings_m))
-
-
-def _largest(values: NDArray[np.float64]) -> float:
-    return float(values.max()) if len(values) else float("nan")
 
 
 def _percentile(values: NDArray[np.float64], percent: float) -> float:
     return float(np.percentile(values, percent)) if len(values) else float("nan")
 
 
-def _frame_columns(frames: Sequence[HullFrame], bodies: list[Body], truth: _Truth) -> SweepFrames:
+def _frame_columns(frames: Sequence[HullFrame], bodies: list[Body], truth: Truth) -> SweepFrames:
     lengths = np.array([len(body.triangles) for body in bodies])
 
     def counts(verdict: int) -> NDArray[np.uint32]:
@@ -478,7 +252,7 @@ def _engine_sweep(
     n_frames: int,
     work: _Work,
     predicted_near_m: NDArray[np.float64],
-    judged: list[_Judgement],
+    judged: list[Judgement],
     query_s: NDArray[np.float64],
     place_s: NDArray[np.float64],
     on_front: NDArray[np.bool_],
@@ -505,7 +279,7 @@ def _engine_sweep(
         triangles_against_proof=np.array(
             [one.triangles_against_proof for one in judged], np.uint32
         ),
-        distance_max_m=np.array([_largest(one.distances_m) for one in judged]),
+        distance_max_m=np.array([largest(one.distances_m) for one in judged]),
         distance_p99_m=np.array([_percentile(one.dense_m, 99) for one in judged]),
         distance_median_m=np.array([_percentile(one.dense_m, 50) for one in judged]),
         within_predicted=np.array(

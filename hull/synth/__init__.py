@@ -10,13 +10,7 @@ and how much room the task needs.
 
 from hybridve.hull.synth.presets import BOXES_PASSING_CLEARANCE_M, PRESETS
 from hybridve.hull.synth.stage import Preset
-from hybridve.hull.synth.truth import (
-    ObjectTruth,
-    SpacingTruth,
-    Truth,
-    read_truth,
-    true_masks,
-)
+from hybridve.hull.synth.truth import ObjectTruth, SpacingTruth, Truth, read_truth, true_masks
 from hybridve.hull.synth.write import write_session
 
 __all__ = [

@@ -26,7 +26,8 @@ from hybridve.hull.synth.presets import PRESETS
 from hybridve.hull.synth.render import Picture, View
 from hybridve.hull.synth.spacing import needed_for_hulls, needed_for_shapes
 from hybridve.hull.synth.stage import Preset, Stage, plate_of
-from hybridve.hull.synth.truth import PartInFrame, TruthWriter, is_generated, look_at
+from hybridve.hull.synth.truth import is_generated
+from hybridve.hull.synth.truth_writer import PartInFrame, TruthWriter, look_at
 
 Progress = Callable[[str, int, int], None]
 

@@ -67,9 +67,7 @@ def hull_cells(hull: Hull, points_world: NDArray[np.float64] | None = None) -> C
         What else the scene holds, in metres.
     """
     views = hull.views
-    matrices = views.img_from_local
-    centers = -np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0]  # (C, 3)
-    reach_m = float(np.linalg.norm(centers, axis=1).max())
+    reach_m = float(np.linalg.norm(views.centers_local(), axis=1).max())
     if points_world is not None and len(points_world):
         reach_m = max(reach_m, float(np.abs(points_world - views.origin_world).max()))
     reach_m = _REACH * reach_m if reach_m > 0 else _DEFAULT_REACH_M

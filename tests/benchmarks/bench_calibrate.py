@@ -1,7 +1,6 @@
 """Calibration: searching pictures, and solving; and how near the rig comes to the truth.
 
-Run: pytest tests/benchmarks/bench_calibrate.py -o python_files='bench_*.py'
--o python_functions='bench_*' --benchmark-columns=median,iqr,rounds
+Run: pytest tests/benchmarks/bench_calibrate.py --full
 """
 
 from pathlib import Path
@@ -23,17 +22,18 @@ HORSEMAN = Chessboard(8, 6, 0.115)
 
 
 @pytest.fixture(scope="session")
-def horseman_inputs(recordings: Path) -> list[CameraInput]:
+def horseman_inputs(recordings: Path, is_full: bool) -> list[CameraInput]:
     root = recordings / "horseman"
+    stills, n_cameras = ("*", 4) if is_full else ("*0", 2)
     return [
         CameraInput(
             name,
             "OPENCV",
-            open_source(root, f"{name}/intrinsics_frames/*.jpg"),
+            open_source(root, f"{name}/intrinsics_frames/{stills}.jpg"),
             open_source(root, f"{name}/checkerboard.avi"),
             None,
         )
-        for name in ("cam1", "cam2", "cam3", "cam4")
+        for name in ("cam1", "cam2", "cam3", "cam4")[:n_cameras]
     ]
 
 
@@ -58,7 +58,8 @@ def bench_horseman_solve(benchmark: Any, horseman_seen: list[Observations]) -> N
     benchmark.extra_info["rms_px"] = rig.provenance.rms_px
 
 
-@pytest.mark.parametrize(("n_cameras", "n_stills"), [(4, 50), (16, 50)])
+@pytest.mark.parametrize(("n_cameras", "n_stills"), [(4, 50), (16, 50), (2, 10)])
+@pytest.mark.smallest(n_cameras=2)
 def bench_solve(benchmark: Any, n_cameras: int, n_stills: int) -> None:
     """Generated corners with 0.2 px of noise; the error of the poses is told beside the time."""
     board = Chessboard(9, 6, 0.05)
@@ -75,6 +76,7 @@ def bench_solve(benchmark: Any, n_cameras: int, n_stills: int) -> None:
 
 @pytest.mark.parametrize("effort", ["quick", "thorough"])
 @pytest.mark.parametrize("shows_board", [True, False])
+@pytest.mark.smallest(shows_board=True, effort="quick")
 def bench_detect(benchmark: Any, effort: str, shows_board: bool) -> None:
     """One picture of 640x480, with the board or a textured floor only."""
     board = Chessboard(9, 6, 0.1)

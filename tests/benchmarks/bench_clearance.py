@@ -8,12 +8,10 @@ that surface from the CAD, whose bounding volumes are built once. Its extra colu
 answers are from the certain ones, in millimetres: that is the resolution of its grid, which it
 cannot bound itself.
 
-Run: pytest tests/benchmarks/bench_clearance.py -o python_files='bench_*.py'
--o python_functions='bench_*' --benchmark-columns=median,iqr,max,rounds
+Run: pytest tests/benchmarks/bench_clearance.py --full
 """
 
 import itertools
-import os
 import time
 from contextlib import closing
 from pathlib import Path
@@ -24,27 +22,26 @@ import pytest
 from helpers.hulls import ball_masks, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
+from hybridve.calib.rig import Rig
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
-from hybridve.hull.capture.rig import calibrate_session
-from hybridve.hull.capture.session import load_session
+from hybridve.hull.capture.session import Session
 from hybridve.hull.chain import rig_views
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull
 
-PROJECT = Path(__file__).parent.parent.parent
-N_FRAMES = 60
+SCENE = Path(__file__).parent.parent.parent / "data" / "horseman" / "scene.toml"
 BALL_RADIUS_M = 0.06
 
 
-def ball_path(views: Views) -> list[tuple[Hull, NDArray[np.float64]]]:
+def ball_path(views: Views, n_frames: int) -> list[tuple[Hull, NDArray[np.float64]]]:
     """Return frames in which a ball passes a sphere of radius 0.2 m at 5 to 80 mm, and its place.
 
     An ellipse about the sphere: every frame asks elsewhere.
     """
     frames = []
-    for turn in np.linspace(0, 2 * np.pi, N_FRAMES, endpoint=False):
+    for turn in np.linspace(0, 2 * np.pi, n_frames, endpoint=False):
         radius_m = 0.2 + BALL_RADIUS_M + 0.0425 + 0.0375 * np.cos(3 * turn)
         center = radius_m * np.array([np.cos(turn), np.sin(turn) * 0.8, 0.6 * np.sin(turn)])
         center *= radius_m / np.linalg.norm(center)
@@ -53,12 +50,13 @@ def ball_path(views: Views) -> list[tuple[Hull, NDArray[np.float64]]]:
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[tuple[Hull, NDArray[np.float64]]]:
-    return ball_path(ring_views(4, 720, 486))
+def frames(is_full: bool) -> list[tuple[Hull, NDArray[np.float64]]]:
+    return ball_path(ring_views(4, 720, 486), 60 if is_full else 3)
 
 
 @pytest.mark.parametrize("tolerance_mm", [1.0, 0.1, 0.01])
 @pytest.mark.parametrize("lap", ["first lap", "later laps"])
+@pytest.mark.smallest(tolerance_mm=1.0)
 def bench_clearance(benchmark: Any, frames: Any, tolerance_mm: float, lap: str) -> None:
     """Hull to bounds; distances that earlier frames computed are kept from one to the next."""
     mesh = sphere_mesh(20_000, 0.2)
@@ -77,7 +75,7 @@ def bench_clearance(benchmark: Any, frames: Any, tolerance_mm: float, lap: str) 
         found = meter.measure(next(hulls))
         widths.append(found.upper_m - found.lower_m)
 
-    benchmark.pedantic(measure, rounds=N_FRAMES)
+    benchmark.pedantic(measure, rounds=len(frames))
     benchmark.extra_info.update(
         triangles=len(mesh), widest_mm=round(1e3 * max(widths), 4), asked_mm=tolerance_mm
     )
@@ -117,6 +115,7 @@ class MeshAndFcl:
 
 
 @pytest.mark.parametrize("voxel_mm", [10, 5, 2.5])
+@pytest.mark.smallest(voxel_mm=10)
 def bench_mesh_and_fcl(benchmark: Any, frames: Any, voxel_mm: float) -> None:
     """Hull to a distance without bounds."""
     mesh = sphere_mesh(20_000, 0.2)
@@ -135,7 +134,7 @@ def bench_mesh_and_fcl(benchmark: Any, frames: Any, voxel_mm: float) -> None:
         hull, center = next(queue)
         peer.distance_m(hull, center, voxel_mm / 1e3)
 
-    for _ in range(20):
+    for _ in range(min(20, len(frames))):
         measure()
     benchmark.pedantic(measure_alone, rounds=20, warmup_rounds=1)
     sampling_ms, surface_ms, fcl_ms = np.median(peer.spent_ms, axis=0).round(2).tolist()
@@ -150,33 +149,34 @@ def bench_mesh_and_fcl(benchmark: Any, frames: Any, voxel_mm: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def horseman(recordings: Path) -> list[Hull]:
-    os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
-    session = load_session(PROJECT / "data" / "horseman")
-    views, undistortions = rig_views(session, calibrate_session(session).rig)
-    frames = segmented_frames(session, FrameRange(0, 400, 4), undistortions=undistortions)
+def person(horseman: tuple[Session, Rig], is_full: bool) -> list[Hull]:
+    session, rig = horseman
+    views, undistortions = rig_views(session, rig)
+    which = FrameRange(0, 400 if is_full else 8, 4)
+    frames = segmented_frames(session, which, undistortions=undistortions)
     with closing(frames):
         return [make_hull(views, frame.masks) for frame in frames if frame.masks is not None]
 
 
 @pytest.mark.recording
 @pytest.mark.parametrize("part", [0, 3, 5])
-def bench_horseman(benchmark: Any, horseman: list[Hull], part: int) -> None:
+@pytest.mark.smallest(part=0)
+def bench_horseman(benchmark: Any, person: list[Hull], part: int) -> None:
     """A link of the robot beside the horseman, its triangles cut into four until they are 20,000.
 
     The base is half a metre away, the forearm and the wrist are reached into.
     """
-    link = load_scene(PROJECT / "data" / "horseman" / "scene.toml").objects[part]
+    link = load_scene(SCENE).objects[part]
     vertices = link.vertices_world
     faces = link.faces if link.solid_faces is None else link.solid_faces
     while len(faces) < 16_000:
         vertices, faces = subdivided(vertices, faces)
     meter = ClearanceMeter(vertices, faces, is_closed=link.is_closed)
-    meter.measure(horseman[-1])
-    hulls = itertools.cycle(horseman)
+    meter.measure(person[-1])
+    hulls = itertools.cycle(person)
     found = []
     benchmark.pedantic(
-        lambda: found.append(meter.measure(next(hulls))), rounds=len(horseman), iterations=1
+        lambda: found.append(meter.measure(next(hulls))), rounds=len(person), iterations=1
     )
     benchmark.extra_info.update(
         object=link.name,
@@ -188,7 +188,8 @@ def bench_horseman(benchmark: Any, horseman: list[Hull], part: int) -> None:
 
 @pytest.mark.recording
 @pytest.mark.parametrize("library", ["hybridve", "libigl", "Open3D"])
-def bench_distances(benchmark: Any, recordings: Path, library: str) -> None:
+@pytest.mark.smallest(library="hybridve")
+def bench_distances(benchmark: Any, recordings: Path, is_full: bool, library: str) -> None:
     """1000 distances to each part of a printer, sized to 0.4 m: time, and how far off the nearest.
 
     What is larger than ours, which is exact but for rounding, is wrong by that.
@@ -201,7 +202,8 @@ def bench_distances(benchmark: Any, recordings: Path, library: str) -> None:
 
     rng = np.random.default_rng(0)
     asked, off_mm = [], {"hybridve": 0.0, "libigl": 0.0, "Open3D": 0.0}
-    for path in sorted((recordings / "meshes" / "prusa").glob("*.stl")):
+    paths = sorted((recordings / "meshes" / "prusa").glob("*.stl"))
+    for path in paths if is_full else paths[:1]:
         mesh = read_cad(path).parts[0]
         vertices = mesh.vertices - (mesh.vertices.max(axis=0) + mesh.vertices.min(axis=0)) / 2
         vertices *= 0.2 / np.abs(vertices).max()

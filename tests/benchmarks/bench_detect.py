@@ -6,7 +6,6 @@ second on two cores, of contacts and their certificates. ``bench_parts`` adds wh
 besides, one after the other.
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +16,20 @@ import pytest
 from hybridve.calib.rig import Rig
 from hybridve.hull.cad.scene import SceneObject, load_scene
 from hybridve.hull.capture.recording import FrameRange
-from hybridve.hull.capture.rig import calibrate_session
-from hybridve.hull.capture.session import Session, load_session
+from hybridve.hull.capture.session import Session
 from hybridve.hull.chain import Chain, EvaluateSettings, rig_views
 from hybridve.hull.contact.detect import Body, make_body
+from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.respond import ResponseSettings
-from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.choose import open_engine
 
-PROJECT = Path(__file__).parent.parent.parent
-N_FRAMES = 100
+SCENE = Path(__file__).parent.parent.parent / "data" / "horseman" / "scene.toml"
 
 
 @pytest.fixture(scope="module")
-def horseman(recordings: Path) -> tuple[Session, Rig]:
-    os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
-    session = load_session(PROJECT / "data" / "horseman")
-    return session, calibrate_session(session).rig
+def frames(is_full: bool) -> FrameRange:
+    return FrameRange(0, 100 if is_full else 2)
 
 
 def subdivided(part: SceneObject, times: int) -> SceneObject:
@@ -59,25 +54,25 @@ def subdivided(part: SceneObject, times: int) -> SceneObject:
     [("native", 0), ("native", 1), ("native", 2), ("native", 3), ("compute", 1)],
     ids=["native-5k", "native-21k", "native-85k", "native-341k", "compute-21k"],
 )
+@pytest.mark.smallest(engine="native", times=0)
 def bench_detect_horseman(
-    benchmark: Any, horseman: tuple[Session, Rig], engine: str, times: int
+    benchmark: Any, horseman: tuple[Session, Rig], frames: FrameRange, engine: str, times: int
 ) -> None:
     cv2.setNumThreads(1)
     session, rig = horseman
-    scene = load_scene(PROJECT / "data" / "horseman" / "scene.toml")
+    scene = load_scene(SCENE)
     bodies: list[Body] = [make_body(subdivided(o, times), viewport=10) for o in scene.objects]
     views, lenses = rig_views(session, rig)
-    settings = EvaluateSettings(frames=FrameRange(0, N_FRAMES))
+    settings = EvaluateSettings(frames=frames)
     chain = Chain(session, rig, scene, settings, lenses, views, bodies, None)
     with open_engine(engine) as query:
 
         def run() -> int:
             return sum(1 for _ in evaluate(chain, query))
 
-        done = benchmark.pedantic(run, rounds=3, warmup_rounds=1)
+        benchmark.extra_info["frames"] = benchmark.pedantic(run, rounds=3, warmup_rounds=1)
         benchmark.extra_info["renderer"] = query.renderer
     benchmark.extra_info["triangles"] = sum(len(body.triangles) for body in bodies)
-    benchmark.extra_info["frames_per_second"] = round(done / benchmark.stats["median"], 1)
 
 
 PARTS: dict[str, dict[str, Any]] = {
@@ -90,19 +85,21 @@ PARTS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.recording
 @pytest.mark.parametrize("parts", list(PARTS))
-def bench_parts(benchmark: Any, horseman: tuple[Session, Rig], parts: str) -> None:
+@pytest.mark.smallest(parts="doubt")
+def bench_parts(
+    benchmark: Any, horseman: tuple[Session, Rig], frames: FrameRange, parts: str
+) -> None:
     """Frames per second with more and more asked of each; 7 links, 3 of which are reached into."""
     cv2.setNumThreads(1)
     session, rig = horseman
-    scene = load_scene(PROJECT / "data" / "horseman" / "scene.toml")
+    scene = load_scene(SCENE)
     bodies = [make_body(one, viewport=10) for one in scene.objects]
     views, lenses = rig_views(session, rig)
-    settings = EvaluateSettings(frames=FrameRange(0, N_FRAMES), **PARTS[parts])
+    settings = EvaluateSettings(frames=frames, **PARTS[parts])
     chain = Chain(session, rig, scene, settings, lenses, views, bodies, None)
     with open_engine("native") as query:
 
         def run() -> int:
             return sum(1 for _ in evaluate(chain, query))
 
-        done = benchmark.pedantic(run, rounds=3, warmup_rounds=1)
-    benchmark.extra_info["frames_per_second"] = round(done / benchmark.stats["median"], 1)
+        benchmark.extra_info["frames"] = benchmark.pedantic(run, rounds=3, warmup_rounds=1)

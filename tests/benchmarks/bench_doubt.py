@@ -5,12 +5,10 @@ given contacts and clearances. ``bench_walk`` walks one ray of an object pixel t
 doubts do, compiled and as `hybridve.hull.query.walk_reference` says; ``bench_walk_rays`` walks 64
 in one call.
 
-Run: pytest tests/benchmarks/bench_doubt.py -o python_files='bench_*.py'
--o python_functions='bench_*' --benchmark-columns=median,iqr,max,rounds
+Run: pytest tests/benchmarks/bench_doubt.py --full
 """
 
 import itertools
-import os
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -20,22 +18,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hybridve.calib.rig import Rig
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
-from hybridve.hull.capture.rig import calibrate_session
-from hybridve.hull.capture.session import load_session
+from hybridve.hull.capture.session import Session
 from hybridve.hull.chain import rig_views
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.components import FAR_M, pixel_rays
 from hybridve.hull.contact.detect import Contact, detect_contacts, make_body
 from hybridve.hull.contact.finding import agreed
-from hybridve.hull.contact.uncertainty import Doubt, Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubt, Doubter
 from hybridve.hull.query import walk_reference
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.query.walk import spans_in_hull, spans_of_rays
 
-FOLDER = Path(__file__).parent.parent.parent / "data" / "horseman"
+SCENE = Path(__file__).parent.parent.parent / "data" / "horseman" / "scene.toml"
 
 Seen = tuple[Hull, list[tuple[Contact, Clearance]]]
 Ray = tuple[Hull, NDArray[np.float64], NDArray[np.float64]]
@@ -44,19 +43,20 @@ pytestmark = pytest.mark.recording
 
 
 @pytest.fixture(scope="module")
-def hulls(recordings: Path) -> list[Hull]:
-    os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
-    session = load_session(FOLDER)
-    views, undistortions = rig_views(session, calibrate_session(session).rig)
-    frames = segmented_frames(session, FrameRange(0, 400, 20), undistortions=undistortions)
+def hulls(horseman: tuple[Session, Rig], is_full: bool) -> list[Hull]:
+    session, rig = horseman
+    views, undistortions = rig_views(session, rig)
+    which = FrameRange(0, 400 if is_full else 40, 20)
+    frames = segmented_frames(session, which, undistortions=undistortions)
     with closing(frames):
         return [make_hull(views, frame.masks) for frame in frames if frame.masks is not None]
 
 
 @pytest.mark.parametrize("near_m", [DoubtSettings().near_m, np.inf])
+@pytest.mark.smallest(near_m=np.inf)
 def bench_doubt(benchmark: Any, hulls: list[Hull], near_m: float) -> None:
     """All links, looked at closely where they are near, and wherever they are."""
-    links = load_scene(FOLDER / "scene.toml").objects
+    links = load_scene(SCENE).objects
     bodies = [make_body(link, viewport=10) for link in links]
     meters = [
         ClearanceMeter(

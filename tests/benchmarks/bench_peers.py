@@ -62,7 +62,6 @@ from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.lens_fit import LensSettings, fit_shared_lens, locate_board
 
 NOISE_PX = 0.3
-N_FRAMES = 60
 
 #: A lens without tangential distortion, its axis in the middle of the image: by name, parameters.
 LENSES = {"OPENCV": None, "RADIAL, centred": (510.0, 510.0, 320.0, 240.0, -0.2, 0.05, 0.0, 0.0)}
@@ -75,24 +74,35 @@ class MissingError(Exception):
     """A peer that is not installed."""
 
 
-def main() -> None:
-    """Write a table, and the same as JSON."""
+def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
+    """Write a table, and the same as JSON; return its numbers."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--cameras", type=int, nargs="+", default=[4, 8])
-    arguments = parser.parse_args()
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--smallest", action="store_true", help="once, 3 cameras, one lens")
+    asked = parser.parse_args(arguments)
+    lenses = list(LENSES)
+    if asked.smallest:
+        asked.seeds, asked.cameras, asked.frames, lenses = 1, [3], 12, lenses[:1]
     rows = []
-    for n_cameras in arguments.cameras:
-        for lens in LENSES:
-            rows += compare(n_cameras, lens, arguments.seeds)
-    if arguments.output:
-        arguments.output.write_text(json.dumps(rows, indent=1) + "\n")
+    for n_cameras in asked.cameras:
+        for lens in lenses:
+            rows += compare(n_cameras, lens, asked.frames, asked.seeds)
+    if asked.output:
+        asked.output.write_text(json.dumps(rows, indent=1) + "\n")
+    return {
+        f"{row['cameras']} cameras, {row['lens']}.{row['peer']}.{name}": value
+        for row in rows
+        for name, value in row.items()
+        if name.endswith(("_mm", "_mrad", "_px", "_s")) or name == "s"
+    }
 
 
-def compare(n_cameras: int, lens: str, n_seeds: int) -> list[dict[str, Any]]:
+def compare(n_cameras: int, lens: str, n_frames: int, n_seeds: int) -> list[dict[str, Any]]:
     """Calibrate one rig with all peers, in turn, and write a line a peer."""
-    scene = moving_scene(n_cameras, N_FRAMES)
+    scene = moving_scene(n_cameras, n_frames)
     if LENSES[lens] is not None:
         params = np.array(LENSES[lens])
         scene = replace(
@@ -123,15 +133,16 @@ def compare(n_cameras: int, lens: str, n_seeds: int) -> list[dict[str, Any]]:
                 }
             )
     place_mm, turn_mrad = least_errors(scene)
-    head = f"{n_cameras} cameras, {lens}, {N_FRAMES} frames, {n_seeds} sets of corners"
+    head = f"{n_cameras} cameras, {lens}, {n_frames} frames, {n_seeds} sets of corners"
+    what = {"rig": head, "cameras": n_cameras, "lens": lens}
     sys.stdout.write(
         f"{head}; load {os.getloadavg()[0]:.1f}\n"
         f"  {'least':12s}{'':32s} place {place_mm:8.3f} mm  turn {turn_mrad:8.3f} mrad\n"
     )
-    rows = [{"rig": head, "peer": "least", "place_mm": place_mm, "turn_mrad": turn_mrad}]
+    rows = [what | {"peer": "least", "place_mm": place_mm, "turn_mrad": turn_mrad}]
     for name in PEERS:
         if name in found:
-            rows.append({"rig": head, "peer": name} | summary(found[name]))
+            rows.append(what | {"peer": name} | summary(found[name]))
             sys.stdout.write(
                 "  {peer:12s}{s:7.2f} s ± {spread_s:5.2f}, cpu {cpu_s:6.2f} s".format(**rows[-1])
             )
@@ -141,7 +152,7 @@ def compare(n_cameras: int, lens: str, n_seeds: int) -> list[dict[str, Any]]:
             )
         if name in failed:
             n_failed = n_seeds - len(found.get(name, ()))
-            rows.append({"rig": head, "peer": name, "failed": n_failed, "why": failed[name]})
+            rows.append(what | {"peer": name, "failed": n_failed, "why": failed[name]})
             sys.stdout.write(f"  {name:12s}{failed[name]} ({n_failed} of {n_seeds})\n")
     sys.stdout.flush()
     return rows

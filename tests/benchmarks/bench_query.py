@@ -6,8 +6,7 @@ hull to hits; ``bench_moving`` the same with new vertices in every frame. ``benc
 is carving with Open3D, a surface by marching cubes, and python-fcl. ``bench_curtain`` is the
 paper's case; ``bench_floor`` reads and writes no more than each frame must.
 
-Run: pytest tests/benchmarks/bench_query.py -o python_files='bench_*.py'
--o python_functions='bench_*' --benchmark-columns=median,iqr,rounds --benchmark-sort=fullname
+Run: pytest tests/benchmarks/bench_query.py --full
 """
 
 from collections.abc import Callable, Iterator
@@ -81,6 +80,7 @@ def tell(benchmark: Any, mesh: Triangles, engine: Engine, hull: Hull) -> None:
 
 
 @pytest.mark.parametrize("n_triangles", SIZES)
+@pytest.mark.smallest(n_triangles=720)
 def bench_frame(
     benchmark: Any, engine: Engine, views: Views, masks: Masks, n_triangles: int
 ) -> None:
@@ -92,6 +92,7 @@ def bench_frame(
 
 
 @pytest.mark.parametrize("n_triangles", SIZES)
+@pytest.mark.smallest(n_triangles=720)
 def bench_query(
     benchmark: Any, engine: Engine, views: Views, masks: Masks, n_triangles: int
 ) -> None:
@@ -104,6 +105,7 @@ def bench_query(
 
 
 @pytest.mark.parametrize("n_triangles", SIZES)
+@pytest.mark.smallest(n_triangles=720)
 def bench_every_hit(benchmark: Any, views: Views, masks: Masks, n_triangles: int) -> None:
     """``native``, and then triangle and number of each single sample instead of runs."""
     next_hull = frames(views, masks)
@@ -115,6 +117,7 @@ def bench_every_hit(benchmark: Any, views: Views, masks: Masks, n_triangles: int
 
 
 @pytest.mark.parametrize("n_triangles", SIZES)
+@pytest.mark.smallest(n_triangles=720)
 def bench_moving(
     benchmark: Any, engine: Engine, views: Views, masks: Masks, n_triangles: int
 ) -> None:
@@ -127,6 +130,7 @@ def bench_moving(
 
 
 @pytest.mark.parametrize("viewport", [64, 512])
+@pytest.mark.smallest(viewport=64, engine="native")
 def bench_large_viewport(
     benchmark: Any, engine: Engine, views: Views, masks: Masks, viewport: int
 ) -> None:
@@ -165,6 +169,7 @@ def bench_floor(benchmark: Any, masks: Masks, what: str) -> None:
 
 
 @pytest.mark.parametrize("n_triangles", [1_000_000, 4_000_000])
+@pytest.mark.smallest(n_triangles=1_000_000)
 def bench_work(
     benchmark: Any,
     monkeypatch: pytest.MonkeyPatch,
@@ -196,7 +201,7 @@ def bench_work(
     for _ in range(2):  # clusters are made for the second frame
         asked.update(clusters=0, triangles=0)
         hull = next_hull()
-        frame = clusters.make_frame(hull)
+        frame = hull.frame
         shares = clusters.make_shares(hull, frame, mesh, threads)
         left = [rectangles.survivors.py_func(*share, frame) for share in shares]
     sampled = sum(int(part.is_open.any(axis=1).sum()) for part in left)
@@ -268,6 +273,7 @@ def decomposed(
 
 @pytest.mark.parametrize("voxel_mm", [10, 5])
 @pytest.mark.parametrize("n_triangles", [720, 20_000, 200_000])
+@pytest.mark.smallest(n_triangles=720, voxel_mm=10)
 def bench_voxels_and_fcl(
     benchmark: Any, views: Views, masks: Masks, n_triangles: int, voxel_mm: int
 ) -> None:
@@ -326,6 +332,5 @@ def bench_curtain(benchmark: Any, name: str) -> None:
             return len(engine.query(make_hull(views, masks), [moved])[0])
 
         assert frame() > 100
-        benchmark.extra_info["renderer"] = engine.renderer
+        benchmark.extra_info.update(renderer=engine.renderer, frames=1)
         benchmark(frame)
-        benchmark.extra_info["frames_per_second"] = round(1 / benchmark.stats["median"])

@@ -8,8 +8,7 @@ of their N_hull in degrees, median and 95 %; and of each N_hull from that of the
 closed form. At 3 m a pixel is 4.3 mm wide, more than I, J, K and L are apart: their cross product
 follows the staircase of pixels, whatever the window.
 
-Run: pytest tests/benchmarks/bench_respond.py -o python_files='bench_*.py'
--o python_functions='bench_*' --benchmark-columns=median,iqr,rounds
+Run: pytest tests/benchmarks/bench_respond.py --full
 """
 
 from itertools import cycle
@@ -66,6 +65,7 @@ def bench_exact(benchmark: Any, hull: Hull, points: Points) -> None:
 
 
 @pytest.mark.parametrize("window", [100, 400, 1600])
+@pytest.mark.smallest(window=100)
 def bench_respond(benchmark: Any, hull: Hull, points: Points, window: int) -> None:
     settings = ResponseSettings(window=window)
 

@@ -5,8 +5,7 @@ camera's IoU with the masks painted by hand; one pixel of boundary is worth abou
 is 3 ms for a frame of one camera. Then the four cameras side by side, as the chain runs them, and
 silhouettes to a file and back: there `frame_ms` is for one frame of all four.
 
-Run: pytest tests/benchmarks/bench_segment.py -o python_files='bench_*.py'
--o python_functions='bench_*' --benchmark-columns=median,iqr,rounds
+Run: pytest tests/benchmarks/bench_segment.py --full
 """
 
 from collections.abc import Callable, Iterator
@@ -28,9 +27,6 @@ from hybridve.hull.capture.silhouette_io import SilhouetteReader, SilhouetteWrit
 pytestmark = pytest.mark.recording
 
 CAMERAS = (1, 2, 3, 4)
-
-#: Frames in a row that are cut and stored, each camera's held in memory.
-N_FRAMES = 40
 
 #: Rows and columns of camera 3 where a board on a chair stands that the empty scene lacks and
 #: nobody painted: an object, but not one to be judged by.
@@ -54,10 +50,10 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def empty(recordings: Path) -> list[list[Image]]:
-    root = recordings / "horseman"
+def empty(recordings: Path, is_full: bool) -> list[list[Image]]:
+    root, stop = recordings / "horseman", 130 if is_full else 13
     return [
-        list(open_source(root, f"cam{camera}/background.avi").frames(stop=130))
+        list(open_source(root, f"cam{camera}/background.avi").frames(stop=stop))
         for camera in CAMERAS
     ]
 
@@ -158,15 +154,16 @@ def bench_learn_background(benchmark: Any, empty: list[list[Image]]) -> None:
 
 
 @pytest.fixture(scope="module")
-def clips(recordings: Path) -> list[list[Image]]:
-    root = recordings / "horseman"
+def clips(recordings: Path, is_full: bool) -> list[list[Image]]:
+    """Frames in a row, in memory."""
+    root, stop = recordings / "horseman", 40 if is_full else 2
     return [
-        list(open_source(root, f"cam{camera}/video.avi").frames(stop=N_FRAMES))
-        for camera in CAMERAS
+        list(open_source(root, f"cam{camera}/video.avi").frames(stop=stop)) for camera in CAMERAS
     ]
 
 
 @pytest.mark.parametrize("n_threads", [1, 2])
+@pytest.mark.smallest(n_threads=2)
 def bench_four_cameras(
     benchmark: Any, empty: list[list[Image]], clips: list[list[Image]], n_threads: int
 ) -> None:
@@ -178,7 +175,7 @@ def bench_four_cameras(
 
     with ThreadPoolExecutor(n_threads) as pool:
         benchmark.pedantic(lambda: list(pool.map(run, range(4))), rounds=10, warmup_rounds=1)
-    benchmark.extra_info["frame_ms"] = round(1000 * benchmark.stats["median"] / N_FRAMES, 2)
+    benchmark.extra_info["frames"] = len(clips[0])
 
 
 def bench_store(
@@ -197,8 +194,8 @@ def bench_store(
             for frame in zip(*masks, strict=True):
                 writer.append(list(frame))
         with SilhouetteReader(path) as reader:
-            return sum(reader.frame(index)[0] is not None for index in range(N_FRAMES))
+            return sum(reader.frame(index)[0] is not None for index in range(len(clips[0])))
 
-    assert benchmark.pedantic(run, rounds=5, warmup_rounds=1) == N_FRAMES
-    benchmark.extra_info["frame_ms"] = round(1000 * benchmark.stats["median"] / N_FRAMES, 2)
-    benchmark.extra_info["bytes_per_frame"] = path.stat().st_size // N_FRAMES
+    n_frames = benchmark.pedantic(run, rounds=5, warmup_rounds=1)
+    assert n_frames == len(clips[0])
+    benchmark.extra_info.update(frames=n_frames, bytes_per_frame=path.stat().st_size // n_frames)

@@ -19,7 +19,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import igl
@@ -42,17 +42,21 @@ _TRUSTED = 1e-3
 Ways = dict[str, Callable[[NDArray[np.float64]], NDArray[np.bool_]]]
 
 
-def main() -> None:
-    """Print a line a part, and the sums."""
+def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
+    """Print a line a part, and the sums; return these."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
+    parser.add_argument("--smallest", action="store_true", help="one file, few points")
+    asked = parser.parse_args(arguments)
     folder = Path(os.environ["HYBRIDVE_DATA"]) / "meshes"
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _KINDS)
+    if asked.smallest:
+        paths, asked.points = paths[:1], 100
     parts = []
-    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in _KINDS):
+    for path in paths:
         cad = read_cad(path)
         parts += [
             (f"{path.name} {part.name}".strip(), part)
@@ -102,6 +106,12 @@ def main() -> None:
             f"near {wrong[name][1].sum()}, on {(wrong[name][1] > 0).sum()}; "
             f"{1e6 * spent_s[name] / n_points:.2f} us a point"
         )
+    told = {"parts": len(parts), "points": n_points, "near": n_near, "judged_exactly": n_rational}
+    for name in names:
+        told[f"{name}.wrong"] = int(wrong[name].sum())
+        told[f"{name}.wrong_far"] = int(wrong[name][0].sum())
+        told[f"{name}.point_us"] = 1e6 * spent_s[name] / n_points
+    return told
 
 
 def _points(

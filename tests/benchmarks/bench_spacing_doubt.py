@@ -13,15 +13,20 @@ Two kinds of task:
 Told are the share of repeats in which the truth is not above the shift at 95 %, and above the shift
 that is found without it; the error's mean and standard deviation; and the deviation stated.
 
-Run: OPENBLAS_NUM_THREADS=1 python tests/benchmarks/bench_spacing_doubt.py balls --frames 1
+Run: OPENBLAS_NUM_THREADS=1 python tests/benchmarks/bench_spacing_doubt.py [--repeats 200]
+(balls of one frame, and the four participants, generated and calibrated on the way), or
+     OPENBLAS_NUM_THREADS=1 python tests/benchmarks/bench_spacing_doubt.py balls --frames 12 --tied
      OPENBLAS_NUM_THREADS=1 python tests/benchmarks/bench_spacing_doubt.py payload SESSION...
 """
 
 import argparse
 import os
 import sys
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -33,21 +38,24 @@ from helpers.erring_task import erring_task
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens_bound import lens_shift_px
-from hybridve.calib.rig import Rig
+from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import moved_pose
-from hybridve.calib.solving.covariance import parameter_slices
+from hybridve.calib.solving.covariance import camera_parameter_names, parameter_slices
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import undistort_mask
-from hybridve.hull.capture.rig import load_rig
+from hybridve.hull.capture.rig import calibrate_session, load_rig
 from hybridve.hull.capture.session import Session, load_session
 from hybridve.hull.chain import rig_views
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
 from hybridve.hull.contact.spacing import Move, blocked_shifts, free_of, union
 from hybridve.hull.contact.spacing_doubt import unsure_shifts
-from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubter
 from hybridve.hull.query.silhouettes import make_hull
 from hybridve.hull.spacing import Layout
+from hybridve.hull.synth import write
 from hybridve.hull.synth.render import make_view, true_silhouette
 from hybridve.hull.synth.truth import SpacingTruth, read_truth
+from hybridve.hull.synth.write import write_session
 
 #: Frames that need less room than the recording by more than this decide nothing, metres.
 _NEAR_M = 0.012
@@ -73,16 +81,21 @@ class Tally:
             np.nan_to_num(np.array(one), nan=np.inf) for one in (self.found_m, self.at_95_m)
         )
         error = 1e3 * (found - truth_m)
+        stated_mm = 1e3 * np.array(self.std_m)[np.isfinite(self.std_m)]
         return (
             f"truth {1e3 * truth_m:.1f} mm; not above the shift at 95 %: {(at_95 >= truth_m).sum()}"
             f" of {len(found)}, above the shift found: {(found < truth_m).sum()}; error mean "
             f"{error.mean():+.2f}, std {error.std():.2f}, median {np.median(error):+.2f} mm; std "
-            f"stated {1e3 * np.nanmean(self.std_m):.2f} mm"
+            f"stated {stated_mm.mean() if len(stated_mm) else np.inf:.2f} mm"
         )
 
+    def n_enough(self, truth_m: float) -> int:
+        """Return how often the shift at 95 % is not too small."""
+        return int((np.nan_to_num(np.array(self.at_95_m), nan=np.inf) >= truth_m).sum())
 
-def balls(arguments: argparse.Namespace) -> None:
-    """Print how often the shift at 95 % suffices for balls before a wall."""
+
+def balls(arguments: argparse.Namespace) -> dict[str, float]:
+    """Print how often the shift at 95 % suffices for balls before a wall, and return it."""
     rng = np.random.default_rng(arguments.seed)
     n_enough, n_found, pulls, repeats = 0, 0, [], 0
     while repeats < arguments.repeats:
@@ -102,14 +115,17 @@ def balls(arguments: argparse.Namespace) -> None:
         f"{arguments.mask_std_px} px: enough at 95 % in {n_enough} of {repeats}, as found in "
         f"{n_found}; errors by deviation: mean {np.mean(pulls):+.2f}, std {np.std(pulls):.2f}\n"
     )
+    return {"balls.repeats": repeats, "balls.enough": n_enough, "balls.enough_as_found": n_found}
 
 
 class Payload:
     """A generated recording, to be seen with errors again and again."""
 
-    def __init__(self, folder: Path, mask_std_px: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, folder: Path, rig: Rig, mask_std_px: float, rng: np.random.Generator
+    ) -> None:
         self._session: Session = load_session(folder)
-        self._calibrated = load_rig(self._session)
+        self._calibrated = rig
         truth = read_truth(folder)
         by_name = {camera.name: camera for camera in truth.cameras}
         self._true = [by_name[camera.name] for camera in self._session.cameras]
@@ -221,34 +237,70 @@ def _inside_px(fine: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(np.where(fine > 0, depth - 0.5, 0.5 - away) / _FINER, np.float32)
 
 
-def payload(arguments: argparse.Namespace) -> None:
-    """Print how often the shift at 95 % suffices for generated recordings."""
-    os.environ["HYBRIDVE_CACHE"] = "off"  # of lenses that are looked through but once
-    for folder in arguments.sessions:
-        task = Payload(folder, arguments.mask_std_px, np.random.default_rng(arguments.seed))
-        tally = Tally([], [], [])
-        for _ in range(arguments.repeats):
-            task.repeat(tally)
+def payload(
+    arguments: argparse.Namespace, recordings: Iterator[tuple[Path, Rig]]
+) -> dict[str, float]:
+    """Print how often the shift at 95 % suffices for generated recordings, and return it."""
+    told: dict[str, float] = {}
+    for number, (folder, rig) in enumerate(recordings, start=1):
+        rng = np.random.default_rng(arguments.seed)
+        with patch.dict(os.environ, HYBRIDVE_CACHE="off"):  # lenses are looked through but once
+            task = Payload(folder, rig, arguments.mask_std_px, rng)
+            tally = Tally([], [], [])
+            for _ in range(arguments.repeats):
+                task.repeat(tally)
         sys.stdout.write(
             f"{folder}: outlines {arguments.mask_std_px} px, {len(task.frames)} frames\n"
             f"  hull: {tally.text(task.truth.needed_hull_m)}\n"
             f"  shapes: {tally.text(task.truth.needed_m)}\n"
         )
         sys.stdout.flush()
+        told[f"participant {number}.enough"] = tally.n_enough(task.truth.needed_hull_m)
+    return told
 
 
-def main() -> None:
-    """Run what is asked for."""
+def participants(folder: Path) -> Iterator[tuple[Path, Rig]]:
+    """Generate and calibrate the recordings of all participants."""
+    for participant in range(1, 5):
+        place = folder / f"participant {participant}"
+        write_session("payload", place, options={"participant": participant})
+        yield place, calibrate_session(load_session(place)).rig
+
+
+def one_frame(folder: Path) -> Iterator[tuple[Path, Rig]]:
+    """Generate one frame of the first, whose rig is the true one and may be a little off."""
+    place = folder / "one frame"
+    with patch.multiple(write, N_STILLS=1, N_BOARD_FRAMES=1, N_BACKGROUND_FRAMES=1):
+        write_session("payload", place, n_frames=1)
+    cameras = tuple(read_truth(place).cameras)
+    labels = tuple(
+        f"{camera.name} {what}" for camera in cameras for what in camera_parameter_names(camera)
+    )
+    yield place, Rig(cameras, covariance=RigCovariance(labels, 1e-8 * np.eye(len(labels))))
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
+    """Run what is asked for, and return its counts."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("kind", choices=["balls", "payload"])
+    parser.add_argument("kind", choices=["balls", "payload"], nargs="?")
     parser.add_argument("sessions", nargs="*", type=Path)
     parser.add_argument("--repeats", type=int, default=200)
     parser.add_argument("--mask-std-px", type=float, default=1.2)
     parser.add_argument("--frames", type=int, default=1)
     parser.add_argument("--tied", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    (balls if arguments.kind == "balls" else payload)(arguments)
+    parser.add_argument("--smallest", action="store_true", help="once, one frame")
+    asked = parser.parse_args(arguments)
+    if asked.kind == "balls":
+        return balls(asked)
+    if asked.kind == "payload":
+        given = ((folder, load_rig(load_session(folder))) for folder in asked.sessions)
+        return payload(asked, given)
+    if asked.smallest:
+        asked.repeats = 1
+    with tempfile.TemporaryDirectory() as folder:
+        make = one_frame if asked.smallest else participants
+        return balls(asked) | payload(asked, make(Path(folder)))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,11 @@ import numpy as np
 import pytest
 from helpers.sessions import write_ball_session, write_cube_scene
 
-from hybridve.calib.formats.rigs import write_rig
-from hybridve.hull.capture.rig import calibrate_session
-from hybridve.hull.capture.session import load_session
+from hybridve.calib.formats.rig_json import write_rig
 
 PROJECT = Path(__file__).parent.parent.parent
+
+Environment = Callable[[Path], dict[str, str]]
 
 #: What the waits are to stay below, in seconds (for the reader: nothing is asserted).
 AIM_S = {"help": 0.5, "cold": 10.0, "first": 10.0, "later": 1.5}
@@ -78,38 +79,54 @@ def job(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         session = write_ball_session(folder, np.zeros((1, 3)))
         scene = write_cube_scene(folder, {"part": (0.0, 0.0, 150.0)})
     else:
-        recordings = request.getfixturevalue("recordings")
-        os.environ.setdefault("HYBRIDVE_DATA", str(recordings))
+        _, rig = request.getfixturevalue("horseman")
         for name in ("session.toml", "scene.toml"):
             (folder / name).write_bytes((PROJECT / "data" / "horseman" / name).read_bytes())
         session, scene = folder / "session.toml", folder / "scene.toml"
         (folder / "rig").mkdir()
-        write_rig(folder / "rig" / "rig.json", calibrate_session(load_session(session)).rig)
+        write_rig(folder / "rig" / "rig.json", rig)
     places = ["--scene", str(scene), "-o", str(folder / "report.h5"), "--overwrite"]
     return ["detect", str(session), *places, "--frames", "0:1"]
 
 
-def with_caches(folder: Path) -> dict[str, str]:
-    """Return the environment in which all that is kept for later is kept in a folder."""
-    others = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-    return others | {
-        "MESA_SHADER_CACHE_DIR": str(folder / "shaders"),
-        "HYBRIDVE_CACHE": str(folder / "hybridve"),
-    }
+@pytest.fixture(scope="module")
+def with_caches(is_full: bool) -> Environment:
+    """The environment in which all that is kept for later is kept in a folder.
+
+    The smallest takes code that is compiled already: compiling takes most of a minute.
+    """
+    others = dict(os.environ)
+    if is_full:
+        others.pop("NUMBA_CACHE_DIR", None)
+    return lambda folder: (
+        others
+        | {
+            "MESA_SHADER_CACHE_DIR": str(folder / "shaders"),
+            "HYBRIDVE_CACHE": str(folder / "hybridve"),
+        }
+    )
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prepared(tmp_path_factory: pytest.TempPathFactory, with_caches: Environment) -> Path:
     """A cache as `make` leaves it."""
     folder = tmp_path_factory.mktemp("prepared")
+    (folder / "hybridve").mkdir()
     Waits().run(["doctor", "--prepare"], with_caches(folder))
     return folder
 
 
 @pytest.mark.parametrize("engine", ["native", "compute"])
 @pytest.mark.parametrize("start", ["cold", "first", "later"])
+@pytest.mark.smallest(job="masks", start="first", engine="native")
 def bench_detect(
-    benchmark: Any, tmp_path: Path, prepared: Path, job: list[str], start: str, engine: str
+    benchmark: Any,
+    tmp_path: Path,
+    with_caches: Environment,
+    prepared: Path,
+    job: list[str],
+    start: str,
+    engine: str,
 ) -> None:
     """From the command to its end; the waits up to the frames and the first one are beside it."""
     waits = Waits()
@@ -136,7 +153,7 @@ def bench_detect(
         benchmark.extra_info[f"{Path(kept).name}_files"] = len(files)
 
 
-def bench_prepare(benchmark: Any, tmp_path: Path) -> None:
+def bench_prepare(benchmark: Any, tmp_path: Path, with_caches: Environment) -> None:
     """``hybridve doctor --prepare`` where nothing is compiled: what `make` adds to an install."""
     waits = Waits()
     folders = (tmp_path / str(number) for number in range(100))

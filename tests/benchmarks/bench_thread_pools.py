@@ -133,18 +133,16 @@ def bench_in_turn(
 
     benchmark.pedantic(work, setup=turn_to_the_others, rounds=_ROUNDS, warmup_rounds=5)
 
+    benchmark.extra_info.update(timed=timed, beside=beside)
+    if "prange" in (timed, beside):
+        benchmark.extra_info["layer"] = numba.threading_layer()
+    if benchmark.stats is None:  # it only ran
+        return
     median_ms = 1000 * benchmark.stats["median"]
     if beside == "nothing":
         _ALONE_MS[timed] = median_ms
     benchmark.extra_info.update(
-        timed=timed,
-        beside=beside,
-        median_ms=round(median_ms, 2),
-        iqr_ms=round(1000 * benchmark.stats["iqr"], 2),
-        min_ms=round(1000 * benchmark.stats["min"], 2),
         times_alone=round(median_ms / _ALONE_MS[timed], 2) if timed in _ALONE_MS else None,
         # The mean: time of a thread that runs is only booked every few milliseconds.
         cpu_ms=round(1000 * (cpu_s[-1] - cpu_s[-_ROUNDS]) / (_ROUNDS - 1), 2),
     )
-    if "prange" in (timed, beside):
-        benchmark.extra_info["layer"] = numba.threading_layer()

@@ -198,6 +198,7 @@ def test_an_obj_cut_off_is_refused_or_said_to_be_open(
         assert found == whole or found[0] == 4 or any("open edges" in note for note in cad.notes)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=8)
 def test_a_step_file_cut_off_reads_the_same_or_is_refused(

@@ -39,6 +39,7 @@ class Box:
         return outside + np.minimum(beyond.max(axis=1), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_bounds_hold_the_exact_distance_of_convex_hulls(seed: int) -> None:
     rng = np.random.default_rng([4, seed])

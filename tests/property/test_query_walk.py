@@ -1,6 +1,7 @@
 """The compiled walk tells what its specification does, whatever the rig and the silhouettes."""
 
 import numpy as np
+import pytest
 from helpers.hulls import EMPTYING_MASK_KINDS, MASK_KINDS, random_masks, random_views
 from helpers.response import camera_center, random_unit
 from hypothesis import given, settings
@@ -39,6 +40,7 @@ def rays(draw: st.DrawFn) -> Rays:
     return hull, starts, units
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(rays=rays(), reach_m=st.sampled_from([0.05, 4.0, 1e3, 1e7]))
 def test_the_compiled_walk_is_the_specification(rays: Rays, reach_m: float) -> None:
