@@ -25,6 +25,11 @@ _WEAK_LABELLING = (
     "an odd sum of columns and rows."
 )
 
+#: A difference beyond the stated error is no chance from so many standard deviations on, and no
+#: rounding if images differ by more than this (pixels): points without noise state next to none.
+_DISAGREES_SIGMAS = 4.0
+_NEGLIGIBLE_PX = 0.01
+
 
 @dataclass(frozen=True, slots=True)
 class Noise(Told):
@@ -390,6 +395,9 @@ class Adjustment(Told):
         Views that contradict the others, and why.
     warnings : tuple of str
         What was found to contradict itself: doubts.
+    start : str or None
+        What it started from, in words, and if not from COLMAP's adjustment why; None in older
+        files.
     """
 
     steps: int
@@ -398,6 +406,63 @@ class Adjustment(Told):
     worst_outliers: tuple[Outlier, ...]
     left_out: dict[str, str]
     warnings: tuple[str, ...]
+    start: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NoOpinion(Told):
+    """That there is no second opinion on a rig, and why, as a sentence.
+
+    Attributes
+    ----------
+    reason : str
+    """
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecondOpinion(Told):
+    """By how much COLMAP's own adjustment of the same points differs from a rig.
+
+    Attributes
+    ----------
+    difference95_m : float
+        How far apart the two place a point that both see, but for the 5 % of the working volume
+        where they differ most.
+    expected95_m : float
+        The same for the stated error (95 %) of COLMAP's adjustment, for the noise that was found:
+        chance makes the two differ by less.
+    sigmas : float
+        The difference in standard deviations of that error.
+    difference95_px : float
+        How far apart the two see a point, in the camera where they differ most.
+    """
+
+    difference95_m: float
+    expected95_m: float
+    sigmas: float
+    difference95_px: float
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the difference is beyond the stated error, and neither chance nor rounding."""
+        return (
+            self.difference95_m > self.expected95_m
+            and self.sigmas > _DISAGREES_SIGMAS
+            and self.difference95_px > _NEGLIGIBLE_PX
+        )
+
+    @property
+    def doubt(self) -> str:
+        """What a difference leaves open, in words."""
+        return (
+            "COLMAP's own adjustment of the same points places what the cameras see "
+            f"{1000 * self.difference95_m:.2f} mm elsewhere, which is {self.sigmas:.1f} standard "
+            f"deviations and beyond its stated error ({1000 * self.expected95_m:.2f} mm): one of "
+            "the two is wrong, or the noise of stills and clip is not what it was taken for; "
+            "compare a distance you know."
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -430,6 +495,8 @@ class CalibrationRecord(Told):
         How it was done, as plain JSON values.
     adjustment : Adjustment or None
         None where all cameras move.
+    second_opinion : SecondOpinion, NoOpinion or None
+        None where all cameras move, and in older files.
 
     Raises
     ------
@@ -449,6 +516,7 @@ class CalibrationRecord(Told):
     world: WorldRecord | None = None
     settings: dict[str, dict[str, Any]]
     adjustment: Adjustment | None = None
+    second_opinion: SecondOpinion | NoOpinion | None = None
 
     def __post_init__(self) -> None:
         still = [camera for camera in self.cameras.values() if camera.mount is None]
@@ -457,6 +525,9 @@ class CalibrationRecord(Told):
         for name in ("world", "adjustment"):
             if getattr(self, name) is None:
                 raise ValueError(f"{name!r} is missing, though cameras stand still")
+        is_new = self.adjustment is not None and self.adjustment.start is not None
+        if is_new and self.second_opinion is None:
+            raise ValueError("'second_opinion' is missing, though cameras stand still")
         lay_still = all(one.extrinsics.other_tilt_times_worse is not None for one in still)
         if lay_still and self.labelling is None:
             raise ValueError("'labelling' is missing, though the boards lay still")
@@ -471,7 +542,12 @@ class CalibrationRecord(Told):
         """What contradicted itself or could not be decided, in words: no gate may pass it."""
         contradictions = () if self.adjustment is None else self.adjustment.warnings
         undecided = self.labelling is not None and self.labelling.is_weak
-        return (*contradictions, *([_WEAK_LABELLING] if undecided else []))
+        other = self.second_opinion
+        return (
+            *contradictions,
+            *([_WEAK_LABELLING] if undecided else []),
+            *([other.doubt] if isinstance(other, SecondOpinion) and other.disagrees else []),
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:

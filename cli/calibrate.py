@@ -218,7 +218,7 @@ def _calibrate(
     if session.rig_file is not None:
         rig = take_elsewhere(session, terminal.stage)
     else:
-        calibration = calibrate_session(session, terminal.stage)
+        calibration = calibrate_session(session, terminal.stage, box_world)
         rig = calibration.rig
         volume = working_volume(rig, box_world)
         seen = {
@@ -342,7 +342,7 @@ def _distances_m(rig: "Rig") -> dict[str, float]:
 
 
 def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
-    from hybridve.calib.judging.certificate import millimetres
+    from hybridve.calib.judging.certificate import millimetres, opinion_text
 
     record = _record_of(rig)
     if certificate is not None:
@@ -372,6 +372,8 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
     if rig.check is not None:
         click.echo(f"  {rig.check.message}")
     if certificate is not None:
+        if certificate.second_opinion is not None:
+            click.echo(f"  {opinion_text(certificate.second_opinion)}")
         for warning in certificate.warnings:
             click.echo(f"  {warning}")
 

@@ -21,6 +21,7 @@ from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.image_io import open_source
 from hybridve.calib.judging.check import check_rig
 from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.record import CalibrationRecord, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 from hybridve.calib.seeing.observe import find_boards, observe_boards
@@ -92,6 +93,15 @@ def test_horseman_corners_miss_by_less_than_half_a_pixel(horseman: Rig) -> None:
         assert told.extrinsics.rms_px < 0.2
         assert told.extrinsics.how.startswith("detected")
     assert json.dumps(rig_to_dict(horseman), allow_nan=False)
+
+
+def test_colmap_agrees_about_horseman(horseman: Rig) -> None:
+    record = horseman.provenance
+
+    assert isinstance(record, CalibrationRecord)
+    assert isinstance(record.second_opinion, SecondOpinion)
+    assert record.second_opinion.difference95_m < record.second_opinion.expected95_m
+    assert record.doubts == ()
 
 
 def test_horseman_cameras_are_above_the_floor_and_upright(horseman: Rig) -> None:
@@ -322,6 +332,8 @@ def test_a_charuco_rig_misses_by_less_than_its_publisher_accepts(recordings: Pat
     misses_px = np.linalg.norm(np.concatenate(list(calibration.residuals_px.values())), axis=1)
     assert misses_px.mean() <= 1.30  # the publisher accepts 1.8, a plain adjustment reached 1.26
     assert len(misses_px) > 5000  # not by leaving out what does not fit
+    assert isinstance(calibration.record.second_opinion, SecondOpinion)
+    assert not calibration.record.second_opinion.disagrees
     first, second, third = calibration.rig.cameras
     for camera in calibration.rig.cameras:
         np.testing.assert_allclose(camera.params[:2], 2855.0, rtol=0.015)

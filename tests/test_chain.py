@@ -9,6 +9,7 @@ import pytest
 
 from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.pose import angle_between, compose, invert
+from hybridve.calib.record import CalibrationRecord, SecondOpinion
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 from hybridve.hull.report.read import read_report
 from hybridve.hull.synth import read_truth, true_masks
@@ -51,6 +52,15 @@ def test_the_rig_is_found_to_a_few_millimetres(folder: Path) -> None:
         # Five times what was measured (1.4 mm, 0.55 mrad): corners are found to 0.02 px.
         assert np.linalg.norm(found.center_world - camera.center_world) < 0.007
         assert angle_between(found.cam_from_world, camera.cam_from_world) < 0.003
+
+
+def test_colmap_agrees_about_the_rig(folder: Path) -> None:
+    record = read_rig(folder / "session" / "rig" / "rig.json").provenance
+
+    assert isinstance(record, CalibrationRecord)
+    assert isinstance(record.second_opinion, SecondOpinion)
+    assert record.second_opinion.difference95_m < record.second_opinion.expected95_m
+    assert record.doubts == ()
 
 
 @pytest.mark.slow

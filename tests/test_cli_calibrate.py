@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from helpers.boards import board_poses, look_at, make_camera, render_board
 from helpers.recorded_boards import held_up
+from helpers.records import make_opinion
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Detection, Effort
@@ -240,6 +241,10 @@ def test_the_text_begins_with_the_verdict(
 
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == calibrated[1]["certificate"]["verdict"]
+    told = calibrated[1]["certificate"]["second_opinion"]
+    assert told["difference95_m"] < told["expected95_m"]
+    (opinion,) = [line for line in lines if "second opinion" in line]
+    assert f"{told['sigmas']:.1f} standard deviations" in opinion
     assert lines[1] == f"{tmp_path / 'rig' / 'rig.json'}: 3 cameras"
 
 
@@ -275,6 +280,10 @@ def labelled_by_chance(made: Calibration) -> Calibration:
     return replace(made, record=replace(made.record, labelling=weak))
 
 
+def contradicted_by_colmap(made: Calibration) -> Calibration:
+    return replace(made, record=replace(made.record, second_opinion=make_opinion(9.0)))
+
+
 def with_a_twin(made: Calibration) -> Calibration:
     first, second, third = made.rig.cameras
     twin = replace(first, name=second.name)
@@ -288,6 +297,7 @@ def with_a_twin(made: Calibration) -> Calibration:
         (contradicted, "cameras do not agree."),
         (labelled_by_chance, "which way round each camera saw it"),
         (with_a_twin, "stand in one place"),
+        (contradicted_by_colmap, "COLMAP's own adjustment of the same points"),
     ],
 )
 def test_a_rig_that_is_doubted_passes_no_gate(
@@ -318,7 +328,11 @@ def test_a_rig_that_is_doubted_passes_no_gate(
 
 @pytest.mark.slow
 def test_the_volume_is_the_one_that_is_asked_for(
-    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+    run: Run,
+    capsys: Captured,
+    calibrated: tuple[Path, dict[str, Any], str],
+    recorded: Path,
+    tmp_path: Path,
 ) -> None:
     box = "0,0,0:600,500,200"
     arguments = ["calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page", "--json"]
@@ -326,6 +340,8 @@ def test_the_volume_is_the_one_that_is_asked_for(
     assert run(*arguments, "--volume-mm", box) == 0
 
     certificate = json.loads(capsys.readouterr().out)["certificate"]
+    usual = calibrated[1]["certificate"]["second_opinion"]
+    assert certificate["second_opinion"]["expected95_m"] < usual["expected95_m"]
     low, high = certificate["volume_low_m"], certificate["volume_high_m"]
     assert (np.array(low) >= -1e-9).all()
     assert (np.array(high) <= [0.6 + 1e-9, 0.5 + 1e-9, 0.2 + 1e-9]).all()

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from helpers.boards import LENSES, look_at, make_camera, ring
-from helpers.records import make_record
+from helpers.records import make_opinion, make_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
@@ -32,7 +32,7 @@ from hybridve.calib.judging.certificate import (
     working_volume,
 )
 from hybridve.calib.lens import cam_from_img, parameter_names, project_points
-from hybridve.calib.record import CalibrationRecord, Noise
+from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion
 from hybridve.calib.rig import POSE_PARAMETERS, Rig, RigCovariance
 from hybridve.calib.solving.covariance import point_errors
 from hybridve.hull.view.certificate_charts import CELLS, binned_means, cell_counts, draw_camera
@@ -179,6 +179,18 @@ def test_the_page_says_what_the_certificate_says(
         assert label in page.folded
     # One figure a camera, the map, and the cameras.
     assert len(page.images()) == len(certificate.cameras) + 2
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_second_opinion_is_told_or_why_there_is_none(tmp_path: Path, is_there: bool) -> None:
+    rig, certificate, seen, volume = case_of(["left", "right"])
+    opinion = make_opinion(1.7) if is_there else NoOpinion("COLMAP has no <lens>")
+
+    page = page_of(tmp_path, (rig, replace(certificate, second_opinion=opinion), seen, volume))
+
+    told = ["1.7 mm", "1.7 standard deviations", "3.0 mm"] if is_there else ["COLMAP has no <lens>"]
+    for words in ("second opinion", *told):
+        assert words in page.text, words
 
 
 def test_nothing_is_fetched_and_nothing_runs(

@@ -249,6 +249,41 @@ def view_residuals(bundle: Bundle) -> tuple[NDArray[np.float64], ...]:
     return _by_view(bundle, groups, _residuals(bundle, groups))
 
 
+def total_cost(bundle: Bundle, loss_px: float = np.inf) -> float:
+    """Return the robust sum of squares of all residuals alike; NaN where a seen point is unseen."""
+    residuals = np.concatenate(_residuals(bundle, _groups(bundle)))
+    return float(_soft((residuals**2).sum(axis=1), loss_px).sum())
+
+
+def even_information(bundle: Bundle) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what tells how an adjustment errs in which all points count alike.
+
+    Returns
+    -------
+    information : (A, A) float64
+        Its normal matrix without the bodies' poses, for points with a noise of one pixel, in the
+        columns of `make_layout`.
+    spread : (A, A) float64
+        The covariance of its gradient, for points as noisy as their views say
+        (`BundleView.sigma_px`): equal to `information` where they say one pixel. The parameters'
+        covariance is ``inv(information) @ spread @ inv(information)``.
+    """
+    layout = make_layout(bundle)
+
+    def normal(power: int) -> _Normal:
+        views = tuple(replace(view, sigma_px=view.sigma_px**power) for view in bundle.views)
+        weighed = replace(bundle, views=views)
+        groups = _groups(weighed)
+        return _normal_equations(weighed, layout, groups, _residuals(weighed, groups), np.inf)
+
+    even, noisy = normal(0), normal(-1)  # a view counts by the inverse of what it says
+    information, _, back, _ = _reduced(even, 0.0)
+    crossed = np.einsum("fia,fib->ab", back, noisy.mixed, optimize=True)
+    of_poses = np.einsum("fia,fij,fjb->ab", back, noisy.poses, back, optimize=True)
+    spread = noisy.rest - crossed - crossed.T + of_poses
+    return information, (spread + spread.T) / 2.0
+
+
 # --- Points, many at once ---------------------------------------------------------------------
 
 
@@ -334,10 +369,15 @@ def _cost(
     groups: Sequence[_Group], residuals: Sequence[NDArray[np.float64]], loss_px: float
 ) -> float:
     """Return the robust sum of squares, weighed; NaN where a seen point has no image."""
-    squares = (np.concatenate(residuals) ** 2).sum(axis=1)
-    if np.isfinite(loss_px):
-        squares = 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
+    squares = _soft((np.concatenate(residuals) ** 2).sum(axis=1), loss_px)
     return float(np.concatenate([group.sigma_px**-2.0 for group in groups]) @ squares)
+
+
+def _soft(squares: NDArray[np.float64], loss_px: float) -> NDArray[np.float64]:
+    """Return squared lengths, pixels squared, as they count: soft L1."""
+    if not np.isfinite(loss_px):
+        return squares
+    return 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
 
 
 # --- One step ---------------------------------------------------------------------------------
