@@ -15,7 +15,7 @@ from hybridve.cli.progress import Terminal
 if TYPE_CHECKING:
     from hybridve.hull.cad.scene import Scene
     from hybridve.hull.capture.recording import FrameRange
-    from hybridve.hull.report.sweep_file import Sweep
+    from hybridve.hull.report.sweep_data import Sweep
     from hybridve.hull.sweep.room import EngineRoom
 
 #: Looks of a sample into a camera that `reference` is given without being asked for: some minutes.
@@ -142,12 +142,8 @@ def sweep(
     from hybridve.hull.query.certify import certify_triangles
     from hybridve.hull.query.choose import open_engine
     from hybridve.hull.report.machine import Run
-    from hybridve.hull.report.sweep_file import (
-        Sweep,
-        read_sweep,
-        sweep_as_dict,
-        write_sweep,
-    )
+    from hybridve.hull.report.sweep_data import Sweep
+    from hybridve.hull.report.sweep_file import read_sweep, sweep_as_dict, write_sweep
     from hybridve.hull.report.write import refuse_existing
     from hybridve.hull.sweep.experiment import run_sweep
     from hybridve.hull.sweep.frames import read_hulls, spread_frames

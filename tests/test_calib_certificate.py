@@ -18,7 +18,8 @@ from hybridve.calib.lens import img_from_cam, parameter_names
 from hybridve.calib.pose import transform
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import POSE
-from hybridve.calib.solving.covariance import camera_parameter_names, parameter_slices
+from hybridve.calib.solving.covariance import camera_parameter_names
+from hybridve.calib.solving.errors_in_space import parameter_slices
 
 CAMERAS = ring(Chessboard(7, 6, 0.1), ["OPENCV"] * 3)
 

@@ -22,7 +22,8 @@ from hybridve.calib.judging.wording import SCALE_TOLERANCE
 from hybridve.calib.pose import compose, rotation_about_axes
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import adjust, moved_pose
-from hybridve.calib.solving.covariance import measure_noise, rig_covariance
+from hybridve.calib.solving.covariance import rig_covariance
+from hybridve.calib.solving.noise import measure_noise
 from hybridve.calib.solving.placement import zoomed
 from hybridve.calib.verdict import RigCheck
 

@@ -18,16 +18,16 @@ from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import Adjusted, adjust, moved_pose
-from hybridve.calib.solving.covariance import (
-    measure_noise,
+from hybridve.calib.solving.covariance import rig_covariance
+from hybridve.calib.solving.errors_in_space import (
     parameter_slices,
     pixel_covariance,
     point_errors,
     point_gains,
     radius95,
-    rig_covariance,
     undistorted_covariance,
 )
+from hybridve.calib.solving.noise import measure_noise
 
 NOISE_PX = 0.3
 N_SEEDS = 25

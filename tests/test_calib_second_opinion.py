@@ -31,13 +31,8 @@ from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion, SecondOpi
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, adjust, moved_pose
 from hybridve.calib.solving.colmap_adjust import colmap_adjust
-from hybridve.calib.solving.covariance import (
-    even_covariance,
-    parameter_slices,
-    point_errors,
-    point_gains,
-    rig_covariance,
-)
+from hybridve.calib.solving.covariance import even_covariance, rig_covariance
+from hybridve.calib.solving.errors_in_space import parameter_slices, point_errors, point_gains
 from hybridve.calib.solving.second_opinion import second_opinion
 
 SCENE = still_scene(n_cameras=3, n_stills=7)

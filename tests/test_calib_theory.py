@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.covariance import point_errors
+from hybridve.calib.solving.errors_in_space import point_errors
 
 NOISE_PX = 0.3
 N_SEEDS = 14

@@ -24,7 +24,8 @@ from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
-from hybridve.hull.report.schema import PATCH_COLUMNS, TABLES, FrameResult
+from hybridve.hull.report.columns import PATCH_COLUMNS, TABLES
+from hybridve.hull.report.schema import FrameResult
 
 FPS = 25
 

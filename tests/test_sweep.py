@@ -30,7 +30,8 @@ from hybridve.hull.query.reference import Reference, contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull, make_views
 from hybridve.hull.report import sweep_file
 from hybridve.hull.report.machine import Run
-from hybridve.hull.report.sweep_file import Sweep, held, read_sweep, sweep_as_dict, write_sweep
+from hybridve.hull.report.sweep_data import Sweep
+from hybridve.hull.report.sweep_file import held, read_sweep, sweep_as_dict, write_sweep
 from hybridve.hull.sweep.cost import fit_cost, window_px_read
 from hybridve.hull.sweep.experiment import Outcome, run_sweep
 from hybridve.hull.sweep.frames import HullFrame, near_bodies, spread_frames

@@ -34,7 +34,7 @@ from hybridve.calib.judging.certificate import (
 from hybridve.calib.lens import cam_from_img, parameter_names, project_points
 from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion
 from hybridve.calib.rig import POSE_PARAMETERS, Rig, RigCovariance
-from hybridve.calib.solving.covariance import point_errors
+from hybridve.calib.solving.errors_in_space import point_errors
 from hybridve.hull.view.certificate_charts import CELLS, binned_means, cell_counts, draw_camera
 from hybridve.hull.view.certificate_page import render, state_of, write_certificate_page
 from hybridve.hull.view.chart_marks import nice

@@ -20,7 +20,7 @@ from hybridve.calib.pose import invert, transform
 from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
-from hybridve.calib.solving.covariance import (
+from hybridve.calib.solving.errors_in_space import (
     image_derivatives,
     parameter_slices,
     pixel_covariance,

@@ -31,15 +31,10 @@ from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose
 from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.consensus import common_pose
-from hybridve.calib.solving.covariance import (
-    even_covariance,
-    in_world,
-    measure_group_noise,
-    measure_noise,
-    parameter_slices,
-    rig_covariance,
-)
+from hybridve.calib.solving.covariance import even_covariance, in_world, rig_covariance
+from hybridve.calib.solving.errors_in_space import parameter_slices
 from hybridve.calib.solving.lens_fit import FittedLens, locate_board, rms
+from hybridve.calib.solving.noise import measure_group_noise, measure_noise
 
 logger = logging.getLogger(__name__)
 

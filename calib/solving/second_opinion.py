@@ -16,7 +16,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import project_points
 from hybridve.calib.record import NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.covariance import image_derivatives, point_gains, radius95
+from hybridve.calib.solving.errors_in_space import image_derivatives, point_gains, radius95
 
 #: The opinion is that of this share of the points.
 _SHARE = 0.95

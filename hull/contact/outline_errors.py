@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.record import CalibrationRecord
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.covariance import undistorted_covariance
+from hybridve.calib.solving.errors_in_space import undistorted_covariance
 from hybridve.hull.contact.components import (
     CELL_M,
 )

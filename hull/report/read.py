@@ -13,19 +13,18 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import ReportError
 from hybridve.hull.contact.verdict import Facts, judge
 from hybridve.hull.report.collisions import Runs, StoredMesh
-from hybridve.hull.report.result_file import reading
-from hybridve.hull.report.schema import (
+from hybridve.hull.report.columns import (
     CAMERA_COLUMNS,
     FRAME_COLUMNS,
     MESH_COLUMNS,
     PATCH_COLUMNS,
     PATCH_OFFSET,
-    READ_VERSIONS,
     RUN_COLUMNS,
     RUN_OFFSET,
     TABLES,
-    Column,
 )
+from hybridve.hull.report.result_file import reading
+from hybridve.hull.report.schema import READ_VERSIONS, Column
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +34,7 @@ class ObjectColumns:
     Attributes
     ----------
     columns : dict of arrays
-        By the names of `hybridve.hull.report.schema`, (F, ...) each; a column that is not there
+        By the names of `hybridve.hull.report.columns`, (F, ...) each; a column that is not there
         was not computed. Places are in the world.
     patches : dict of arrays
         By their names without ``patches/``: one row a patch, places in the world; ``offset``: those

@@ -26,9 +26,7 @@ from hybridve.calib.errors import ReportError
 from hybridve.calib.files import appearing
 from hybridve.hull.contact.finding import Finding
 from hybridve.hull.report.collisions import Runs, StoredMesh
-from hybridve.hull.report.machine import utc_now
-from hybridve.hull.report.result_file import STORED, store, store_text, write_run, writing
-from hybridve.hull.report.schema import (
+from hybridve.hull.report.columns import (
     CAMERA_COLUMNS,
     FRAME_COLUMNS,
     MESH_COLUMNS,
@@ -38,12 +36,11 @@ from hybridve.hull.report.schema import (
     POINT_OFFSET,
     RUN_COLUMNS,
     RUN_OFFSET,
-    VERSION,
-    Column,
-    FrameResult,
-    ReportHeader,
     tables_of,
 )
+from hybridve.hull.report.machine import utc_now
+from hybridve.hull.report.result_file import STORED, store, store_text, write_run, writing
+from hybridve.hull.report.schema import VERSION, Column, FrameResult, ReportHeader
 from hybridve.hull.report.vtk import MOST_SHOWN, FramePoints, add_vtkhdf
 
 #: A part is finished after this many frames or runs of collision points, whichever comes first.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from hybridve.hull.report.sweep_file import CostModel
+from hybridve.hull.report.sweep_data import CostModel
 
 #: The terms of the model: fixed, fill, read-back.
 N_TERMS = 3

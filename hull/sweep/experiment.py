@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.contact.detect import Body, collision_points
 from hybridve.hull.query.engine import Engine
-from hybridve.hull.report.sweep_file import EngineSweep, SweepFrames, SweepRows, TruthSettings
+from hybridve.hull.report.sweep_data import EngineSweep, SweepFrames, SweepRows, TruthSettings
 from hybridve.hull.sweep.cost import fit_cost, window_px_read
 from hybridve.hull.sweep.frames import HullFrame
 from hybridve.hull.sweep.front import pareto_front

@@ -12,7 +12,7 @@ from hybridve.calib.errors import DeviceError
 from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.detect import Body, collision_points, make_body
 from hybridve.hull.query.engine import Hits
-from hybridve.hull.report.sweep_file import TruthSettings
+from hybridve.hull.report.sweep_data import TruthSettings
 from hybridve.hull.sweep.frames import HullFrame
 from hybridve.hull.sweep.room import EngineRoom
 from hybridve.hull.sweep.truth import (

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridve.hull.report.sweep_file import Sweep
+from hybridve.hull.report.sweep_data import Sweep
 from hybridve.hull.view.chart import Curve, write_chart
 
 

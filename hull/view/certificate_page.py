@@ -24,7 +24,7 @@ from hybridve.calib.lens import parameter_names
 from hybridve.calib.record import NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
-from hybridve.calib.solving.covariance import parameter_slices
+from hybridve.calib.solving.errors_in_space import parameter_slices
 from hybridve.hull.view.certificate_charts import draw_camera
 from hybridve.hull.view.rig_charts import draw_errors, draw_rig
 

@@ -19,7 +19,7 @@ from hybridve.calib.judging.certificate import Volume
 from hybridve.calib.lens import cam_from_img
 from hybridve.calib.pose import invert, transform
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.covariance import point_errors
+from hybridve.calib.solving.errors_in_space import point_errors
 from hybridve.hull.view.chart_marks import (
     BLUE,
     GREEN,

@@ -40,7 +40,8 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import moved_pose
-from hybridve.calib.solving.covariance import camera_parameter_names, parameter_slices
+from hybridve.calib.solving.covariance import camera_parameter_names
+from hybridve.calib.solving.errors_in_space import parameter_slices
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import undistort_mask
 from hybridve.hull.capture.rig import calibrate_session, load_rig

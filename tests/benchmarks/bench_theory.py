@@ -46,7 +46,7 @@ from helpers.theory import (
 
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.solving.covariance import parameter_slices, point_errors
+from hybridve.calib.solving.errors_in_space import parameter_slices, point_errors
 from hybridve.calib.solving.lens_fit import LensSettings
 
 N_STILLS = 20

@@ -14,7 +14,7 @@ from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes, transform
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import Bundle, BundleView
-from hybridve.calib.solving.covariance import image_derivatives
+from hybridve.calib.solving.errors_in_space import image_derivatives
 
 BOARD = Chessboard(9, 6, 0.1)
 
