@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,14 +139,12 @@ def spacing(
     import cv2
 
     from hybridve.calib.errors import SessionError
-    from hybridve.hull.cad.scene import load_scene
-    from hybridve.hull.capture.session import load_session
-    from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
+    from hybridve.hull.chain import EvaluateSettings
     from hybridve.hull.report.compare import distinct_names
-    from hybridve.hull.report.machine import Run
-    from hybridve.hull.report.spacing_file import Spacing, spacing_as_dict, write_spacing
+    from hybridve.hull.report.spacing_file import spacing_as_dict, write_spacing
     from hybridve.hull.report.write import refuse_existing
-    from hybridve.hull.spacing import Layout, replay, shifts_of, write_picture_of
+    from hybridve.hull.spacing import SpacingRequest, find_spacing
+    from hybridve.hull.spacing_picture import write_picture_of
     from hybridve.hull.view.chart import SUFFIXES
 
     cv2.setNumThreads(1)
@@ -159,52 +156,21 @@ def spacing(
     for path in (output, picture):
         if path is not None:
             refuse_existing(path, overwrite=overwrite)
-    move = _move_of(along, range_mm, clearance_mm, tolerance_mm)
-    shifts_m = shifts_of(move, None if step_mm is None else step_mm / 1e3)
+    asked = SpacingRequest(
+        moved,
+        _move_of(along, range_mm, clearance_mm, tolerance_mm),
+        clearance_m=None if clearance_mm is None else clearance_mm / 1e3,
+        grow_px=grow_px,
+        step_m=None if step_mm is None else step_mm / 1e3,
+        evaluation=EvaluateSettings(
+            frames=frames, doubt=options.doubt_of(doubt=doubt, mask_std_px=mask_std_px)
+        ),
+    )
     try:
-        names = distinct_names(sessions, "session.toml")
+        named = dict(zip(distinct_names(sessions, "session.toml"), sessions, strict=True))
     except ValueError as error:
         raise SessionError(f"{error}; each session is a column of its own, name it once") from None
-    loaded_scene = load_scene(scene)
-    layout = Layout.of(
-        loaded_scene, moved, move, None if clearance_mm is None else clearance_mm / 1e3
-    )
-    settings = EvaluateSettings(
-        frames=frames, doubt=options.doubt_of(doubt=doubt, mask_std_px=mask_std_px)
-    )
-    chains = [make_chain(load_session(path), loaded_scene, settings) for path in sessions]
-
-    found = []
-    for name, chain in zip(names, chains, strict=True):
-        with terminal.steps(f"spacing {name}", count_frames(chain)) as advance:
-            found.append(
-                replay(
-                    name,
-                    chain,
-                    layout,
-                    shifts_m,
-                    grow_px=grow_px,
-                    progress=terminal.stage,
-                    advance=advance,
-                )
-            )
-    result = Spacing(
-        run=Run.now(options.command_line()),
-        settings={
-            "scene": str(loaded_scene.path),
-            "scene_sha256": loaded_scene.checksum,
-            "move": list(layout.moved_names),
-            "required_m": [one.clearance_m for one in layout.moved],
-            "direction": move.direction.tolist(),
-            "start_m": move.start_m,
-            "stop_m": move.stop_m,
-            "tolerance_m": move.tolerance_m,
-            "grow_px": grow_px,
-            "doubt": None if settings.doubt is None else asdict(settings.doubt),
-            "frames": str(frames),
-        },
-        sessions=tuple(found),
-    )
+    result = find_spacing(named, scene, asked, options.command_line(), terminal)
     if output is not None:
         write_spacing(output, result)
     if picture is not None:

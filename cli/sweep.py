@@ -1,9 +1,6 @@
 """``hybridve sweep``: accuracy against time, over viewports and engines."""
 
 import json
-from contextlib import ExitStack
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -13,13 +10,8 @@ from hybridve.cli import options
 from hybridve.cli.progress import Terminal
 
 if TYPE_CHECKING:
-    from hybridve.hull.cad.scene import Scene
     from hybridve.hull.capture.recording import FrameRange
     from hybridve.hull.report.sweep_data import Sweep
-    from hybridve.hull.sweep.room import EngineRoom
-
-#: Looks of a sample into a camera that `reference` is given without being asked for: some minutes.
-_MOST_REFERENCE_LOOKS = 10**9
 
 _ENGINES: tuple[options.EngineName, ...] = tuple(
     name for name in get_args(options.EngineName) if name != "auto"
@@ -135,21 +127,12 @@ def sweep(
     """
     import cv2
 
-    from hybridve.hull.about import about_objects, resolved_settings
     from hybridve.hull.cad.scene import load_scene
     from hybridve.hull.capture.session import load_session
-    from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
-    from hybridve.hull.query.certify import certify_triangles
-    from hybridve.hull.query.choose import open_engine
-    from hybridve.hull.report.machine import Run
-    from hybridve.hull.report.sweep_data import Sweep
     from hybridve.hull.report.sweep_file import read_sweep, sweep_as_dict, write_sweep
     from hybridve.hull.report.write import refuse_existing
-    from hybridve.hull.sweep.experiment import run_sweep
-    from hybridve.hull.sweep.frames import read_hulls, spread_frames
-    from hybridve.hull.sweep.judgement import make_rows, samples_asked
     from hybridve.hull.sweep.picture import write_picture_of
-    from hybridve.hull.sweep.room import EngineRoom
+    from hybridve.hull.sweep.session import SweepRequest, sweep_session
     from hybridve.hull.view.chart import SUFFIXES
 
     cv2.setNumThreads(1)
@@ -162,73 +145,24 @@ def sweep(
     for path in (output, picture):
         refuse_existing(path, overwrite=overwrite)
 
-    loaded_scene = load_scene(scene)
-    accuracy_m = (
-        _middle_accuracy_m(loaded_scene, viewports) if accuracy_mm is None else accuracy_mm / 1e3
+    asked = SweepRequest(
+        viewports=viewports,
+        engines=engines,
+        frames=frames,
+        repeats=repeats,
+        open_at_m=open_at_mm / 1e3,
+        accuracy_m=None if accuracy_mm is None else accuracy_mm / 1e3,
     )
-    settings = EvaluateSettings(viewport=None, accuracy_m=accuracy_m)
-    if frames is not None:
-        settings = replace(settings, frames=frames)
-    chain = make_chain(load_session(session), loaded_scene, settings)
-    if frames is None:
-        spread = spread_frames(count_frames(chain))
-        chain = replace(chain, settings=replace(settings, frames=spread))
-    rows = make_rows(loaded_scene.objects, viewports, accuracy_m)
-
-    with ExitStack() as stack:
-        rooms = _open_rooms(engines, stack)
-        with terminal.steps("silhouettes", count_frames(chain)) as advance:
-            hulls = read_hulls(chain, terminal.stage, advance)
-        looks = samples_asked(hulls, rows) * len(chain.views) * (repeats + 1)
-        if not engines and looks > _MOST_REFERENCE_LOOKS:
-            rooms = [room for room in rooms if room.engine.name != "reference"]
-            click.echo(
-                f"reference is left out: {looks:.1e} looks of samples into cameras take it about "
-                f"{looks / 1e7 / 60:.0f} minutes; name it with --engine to have it",
-                err=True,
-            )
-        if any(room.engine.name == "native" for room in rooms):
-            truth_room = next(room for room in rooms if room.engine.name == "native")
-        else:
-            truth_room = stack.enter_context(EngineRoom(partial(open_engine, "native")))
-        steps = len(hulls) + len(rows) * len(rooms) * (repeats + 1)
-        with terminal.steps("sweep", steps, unit="step") as advance:
-            outcome = run_sweep(
-                hulls,
-                rows,
-                rooms,
-                certify=certify_triangles,
-                open_at_m=open_at_mm / 1e3,
-                truth_room=truth_room,
-                repeats=repeats,
-                advance=advance,
-                leave_out=None if engines else _leave_out,
-            )
-    write_sweep(
-        output,
-        Sweep(
-            run=Run.now(options.command_line()),
-            settings={
-                **resolved_settings(chain),
-                "viewports": list(viewports),
-                "engines": [engine.name for engine in outcome.engines],
-                "repeats": repeats,
-                "open_at_m": open_at_mm / 1e3,
-                "objects": list(about_objects(chain)),
-            },
-            cameras=len(chain.views),
-            rows=outcome.rows,
-            frames=outcome.frames,
-            truth=outcome.truth,
-            engines=outcome.engines,
-        ),
+    measured = sweep_session(
+        load_session(session), load_scene(scene), asked, options.command_line(), terminal
     )
+    write_sweep(output, measured)
     written = read_sweep(output)
     write_picture_of(picture, written)
     if not written.frames.triangles_colliding.any():
         click.echo(
-            f"nothing collides in the frames {chain.settings.frames}: accuracy cannot be measured "
-            "there, only time; choose others with --frames",
+            f"nothing collides in the frames {written.settings['frames']}: accuracy cannot be "
+            "measured there, only time; choose others with --frames",
             err=True,
         )
     if as_json:
@@ -236,35 +170,6 @@ def sweep(
         click.echo(json.dumps({**names, **sweep_as_dict(written)}))
     else:
         _print_table(output, picture, written)
-
-
-def _middle_accuracy_m(scene: "Scene", viewports: tuple[int, ...]) -> float:
-    """Return what the middle viewport predicts: the largest edge / (u - 1) of the scene."""
-    from hybridve.hull.contact.detect import make_body
-
-    middle = viewports[len(viewports) // 2]
-    return max(make_body(one, viewport=middle).spacing_m for one in scene.objects)
-
-
-def _open_rooms(engines: tuple[options.EngineName, ...], stack: ExitStack) -> list["EngineRoom"]:
-    """Return the engines that were named, or else all that can be opened."""
-    from hybridve.calib.errors import DeviceError
-    from hybridve.hull.query.choose import open_engine
-    from hybridve.hull.sweep.room import EngineRoom
-
-    rooms = []
-    for name in engines or _ENGINES:
-        try:
-            rooms.append(stack.enter_context(EngineRoom(partial(open_engine, name))))
-        except (DeviceError, ImportError) as error:  # ImportError: moderngl without its libraries
-            if engines:
-                raise DeviceError(f"engine {name}: {error}") from error
-            _leave_out(name, error)
-    return rooms
-
-
-def _leave_out(name: str, error: Exception) -> None:
-    click.echo(f"{name} is left out: {error}", err=True)
 
 
 def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
@@ -325,10 +230,7 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
                     "*" if row["on_front"] else "",
                 )
             )
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    for line in lines:
-        cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
-        click.echo("  " + "  ".join(cells).rstrip())
+    options.print_table(lines)
     for engine in found["engines"]:
         click.echo(f"  {engine['name']}: {_cost_text(engine['name'], engine['cost'])}")
     stages = ", ".join(

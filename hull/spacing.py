@@ -1,9 +1,9 @@
 """How much room a recorded task needs: one replay of the recording, for all shifts at once."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
@@ -12,8 +12,16 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.hull.about import resolved_settings
-from hybridve.hull.cad.scene import Scene, SceneObject
-from hybridve.hull.chain import Chain, hulls, make_doubter
+from hybridve.hull.cad.scene import Scene, SceneObject, load_scene
+from hybridve.hull.capture.session import load_session
+from hybridve.hull.chain import (
+    Chain,
+    EvaluateSettings,
+    count_frames,
+    hulls,
+    make_chain,
+    make_doubter,
+)
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
 from hybridve.hull.contact.spacing import (
@@ -33,6 +41,7 @@ from hybridve.hull.contact.spacing import (
 from hybridve.hull.contact.spacing_doubt import UnsureShifts, unsure_shifts
 from hybridve.hull.contact.uncertainty import Doubter, FrameDoubts
 from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.report.machine import Run
 from hybridve.hull.report.spacing_file import (
     Binding,
     SessionSpacing,
@@ -42,7 +51,7 @@ from hybridve.hull.report.spacing_file import (
     SpacingFrames,
     make_stretches,
 )
-from hybridve.hull.view.spacing_chart import DoubtCurve, ShiftCurve, write_spacing_chart
+from hybridve.hull.watcher import Watcher
 
 #: Points of a curve at most; what a frame blocks is known for all shifts anyway.
 _MOST_POINTS = 100_000
@@ -143,6 +152,102 @@ def shifts_of(move: Move, step_m: float | None = None) -> NDArray[np.float64]:
         )
     steps_m = move.start_m + step_m * np.arange(int(np.ceil(n_steps)))
     return np.append(steps_m[steps_m < move.stop_m], move.stop_m)
+
+
+@dataclass(frozen=True, slots=True)
+class SpacingRequest:
+    """What is asked of all recordings.
+
+    Attributes
+    ----------
+    moved : tuple of str
+        The objects that are moved.
+    move : Move
+        Whereto.
+    clearance_m : float or None
+        What they require; None for what the scene says of each.
+    grow_px : int
+        By how many pixels all silhouettes are grown.
+    step_m : float or None
+        Steps of the curve; None for a two hundredth of the range.
+    evaluation : EvaluateSettings
+        Which frames, and what is assumed of outlines.
+    """
+
+    moved: tuple[str, ...]
+    move: Move
+    clearance_m: float | None
+    grow_px: int
+    step_m: float | None
+    evaluation: EvaluateSettings
+
+
+def find_spacing(
+    sessions: Mapping[str, Path],
+    scene_path: Path,
+    asked: SpacingRequest,
+    command: str,
+    watcher: Watcher,
+) -> Spacing:
+    """Return how much room the tasks of recordings need, each replayed once.
+
+    Parameters
+    ----------
+    sessions : mapping of str to Path
+        The recordings, by what they are called.
+    scene_path : Path
+        The layout.
+    asked : SpacingRequest
+        What is moved, and how.
+    command : str
+        What was called, for the file.
+    watcher : Watcher
+        Told how far it is.
+
+    Raises
+    ------
+    HybridveError
+        If recordings, rig and scene do not fit together, or no frame can be evaluated.
+    """
+    shifts_m = shifts_of(asked.move, asked.step_m)
+    scene = load_scene(scene_path)
+    layout = Layout.of(scene, asked.moved, asked.move, asked.clearance_m)
+    chains = {
+        name: make_chain(load_session(path), scene, asked.evaluation)
+        for name, path in sessions.items()
+    }
+    found = []
+    for name, chain in chains.items():
+        with watcher.steps(f"spacing {name}", count_frames(chain)) as advance:
+            found.append(
+                replay(
+                    name,
+                    chain,
+                    layout,
+                    shifts_m,
+                    grow_px=asked.grow_px,
+                    progress=watcher.stage,
+                    advance=advance,
+                )
+            )
+    move, doubt = asked.move, asked.evaluation.doubt
+    return Spacing(
+        run=Run.now(command),
+        settings={
+            "scene": str(scene.path),
+            "scene_sha256": scene.checksum,
+            "move": list(layout.moved_names),
+            "required_m": [one.clearance_m for one in layout.moved],
+            "direction": move.direction.tolist(),
+            "start_m": move.start_m,
+            "stop_m": move.stop_m,
+            "tolerance_m": move.tolerance_m,
+            "grow_px": asked.grow_px,
+            "doubt": None if doubt is None else asdict(doubt),
+            "frames": str(asked.evaluation.frames),
+        },
+        sessions=tuple(found),
+    )
 
 
 def replay(
@@ -381,47 +486,3 @@ class _Tally:
 
 def _spare_m(binding: Binding) -> float:
     return float(binding.clearance_m[1]) - binding.required_m
-
-
-def write_picture_of(path: Path, spacing: Spacing) -> None:
-    """Draw how many frames violate against the shift, one curve a session.
-
-    Raises
-    ------
-    ReportError
-        If it cannot be written.
-    """
-    settings = spacing.settings
-    curves = [curve_of(one) for one in spacing.sessions]
-    direction = ", ".join(f"{value:.3g}" for value in settings["direction"])
-    required = ", ".join(f"{1e3 * one:g}" for one in dict.fromkeys(settings["required_m"]))
-    title = (
-        f"{', '.join(settings['move'])} along ({direction}), keeping {required} mm: frames that "
-        "violate it"
-    )
-    write_spacing_chart(path, curves, title=title)
-
-
-def curve_of(one: SessionSpacing) -> ShiftCurve:
-    """Return the curve of one session with every step where it is, not where it was counted."""
-    frames, counted_m = one.frames, one.curve.shift_m
-    ends_m = [frames.violated.shift_m.ravel(), frames.undecided.shift_m.ravel()]
-    if one.doubt is not None:
-        ends_m.append(one.doubt.unsure.shift_m.ravel())
-    shift_m = np.unique(np.concatenate([counted_m[[0, -1]], *ends_m]))
-    middle_m = 0.5 * (shift_m[1:] + shift_m[:-1])
-    violated, at_most, unsure = (np.zeros(len(middle_m)) for _ in range(3))
-    for row in range(len(frames.index)):
-        certain = covers(frames.violated.of(row), middle_m)
-        violated += certain
-        at_most += certain | covers(frames.undecided.of(row), middle_m)
-        if one.doubt is not None:
-            unsure += covers(one.doubt.unsure.of(row), middle_m)
-    return ShiftCurve(
-        name=f"{one.name} ({frames.n_valid} frames)",
-        shift_mm=1e3 * shift_m,
-        violated=violated,
-        at_most=at_most,
-        answer_mm=1e3 * one.shift_m,
-        doubt=None if one.doubt is None else DoubtCurve(unsure, 1e3 * one.doubt.shift_m),
-    )

@@ -11,7 +11,7 @@ from helpers.sessions import write_ball_session, write_cube_scene
 from matplotlib.patches import StepPatch
 
 from hybridve.hull.report.spacing_file import read_spacing, spacing_as_dict
-from hybridve.hull.spacing import curve_of
+from hybridve.hull.spacing_picture import curve_of
 from hybridve.hull.view.spacing_chart import DoubtCurve, ShiftCurve, draw_spacing_chart
 
 Run = Callable[..., int]

@@ -177,7 +177,7 @@ def test_the_reference_is_left_out_where_it_would_take_long(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from hybridve.cli import sweep as command
+    from hybridve.hull.sweep import session as command
 
     monkeypatch.setattr(command, "_MOST_REFERENCE_LOOKS", 10)
     at = quick.index("--engine")
