@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -191,6 +193,23 @@ def test_a_second_run_reads_no_picture_and_says_the_same(
     again = json.loads(capsys.readouterr().out)
     assert again["certificate"] == calibrated[1]["certificate"]
     assert not (out / "certificate.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("calibrated")
+def test_without_a_page_nothing_is_loaded_that_makes_one(recorded: Path, tmp_path: Path) -> None:
+    arguments = ["calibrate", str(standing(recorded)), "-o", str(tmp_path / "rig"), "--no-page"]
+    code = (
+        f"import sys\nsys.argv = ['hybridve', *{arguments}]\n"
+        "from hybridve.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit as left:\n    assert not left.code\n"
+        "print([n for n in ('jinja2', 'matplotlib') if n in sys.modules])"
+    )
+
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert (tmp_path / "rig" / "rig.json").exists()
+    assert shown.stdout.strip().endswith("[]")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What is shipped: the wheel holds the package, its shaders and nothing else.
+"""What is shipped: the wheel holds the package, its shaders, its templates and nothing else.
 
 And what its modules keep to themselves.
 """
@@ -44,9 +44,9 @@ def test_the_wheel_holds_the_package_and_nothing_beside_it(wheel_names: list[str
     assert {top for top in tops if not top.endswith(".dist-info")} == {"hybridve"}
 
 
-def test_every_source_file_and_shader_is_in_the_wheel(wheel_names: list[str]) -> None:
+def test_every_file_that_the_package_reads_is_in_the_wheel(wheel_names: list[str]) -> None:
     for folder in ("cli", "hull", "calib"):
-        for pattern in ("*.py", "*.glsl", "py.typed"):
+        for pattern in ("*.py", "*.glsl", "*.jinja", "*.css", "py.typed"):
             for path in (PROJECT / folder).rglob(pattern):
                 name = f"hybridve/{path.relative_to(PROJECT).as_posix()}"
                 assert name in wheel_names, f"{name} is missing: list it in pyproject.toml"

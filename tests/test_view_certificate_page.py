@@ -36,8 +36,9 @@ from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion
 from hybridve.calib.rig import POSE_PARAMETERS, Rig, RigCovariance
 from hybridve.calib.solving.errors_in_space import point_errors
 from hybridve.hull.view.certificate_charts import CELLS, binned_means, cell_counts, draw_camera
-from hybridve.hull.view.certificate_page import render, state_of, write_certificate_page
+from hybridve.hull.view.certificate_page import state_of, write_certificate_page
 from hybridve.hull.view.chart_marks import nice
+from hybridve.hull.view.pages import page_template
 from hybridve.hull.view.rig_charts import draw_errors, draw_rig, frustum, slice_errors
 
 NOISE_PX = 0.25
@@ -340,6 +341,11 @@ PLAIN = st.recursive(
 )
 
 
+def shown(value: Any) -> Page:
+    """Return how the page shows a value of the details."""
+    return Page(vars(page_template("values.html.jinja").module)["shown"](value))
+
+
 def words_of(value: Any) -> list[str]:
     if isinstance(value, dict):
         return [word for pair in value.items() for one in pair for word in words_of(one)]
@@ -351,7 +357,7 @@ def words_of(value: Any) -> list[str]:
 @settings(max_examples=60)
 @given(value=PLAIN)
 def test_every_word_of_the_details_is_there_however_nested(value: Any) -> None:
-    page = Page(render(value))
+    page = shown(value)
 
     for word in words_of(value):
         assert " ".join(word.split()) in page.text
@@ -359,11 +365,11 @@ def test_every_word_of_the_details_is_there_however_nested(value: Any) -> None:
 
 
 def test_long_lists_are_folded_and_short_ones_are_not() -> None:
-    short, long = Page(render(list("abcdef"))), Page(render([f"view {k}" for k in range(30)]))
-    rows = Page(render([{"camera": f"cam{k}", "px": 0.5} for k in range(5)]))
+    short, long = shown(list("abcdef")), shown([f"view {k}" for k in range(30)])
+    rows = shown([{"camera": f"cam{k}", "px": 0.5} for k in range(5)])
 
     assert short.words == ["a, b, c, d, e, f"]
-    assert Page(render(set("fbdace"))).words == short.words
+    assert shown(set("fbdace")).words == short.words
     assert long.words == []
     assert "view 17" in long.text
     assert [tag for tag, _ in rows.elements].count("th") == 2  # each key once
