@@ -17,9 +17,9 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.judging.check import SCALE_TOLERANCE, SIGNIFICANCE, check_rig
 from hybridve.calib.judging.comparison import chance_of
-from hybridve.calib.pose import compose, rotation_about_axes
+from hybridve.calib.pose import compose, moved_pose, rotation_about_axes
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.bundle import adjust, moved_pose
+from hybridve.calib.solving.bundle import adjust
 from hybridve.calib.solving.covariance import measure_noise, rig_covariance
 from hybridve.calib.solving.placement import zoomed
 from hybridve.calib.verdict import RigCheck
