@@ -32,7 +32,7 @@ _MOST_DAMPING = 1e12
 _DAMPING_FACTOR = 10.0
 
 #: Of the largest eigenvalue: what is below is rounding.
-_ROUNDING = 3e-15
+_ROUNDING = _LEAST_DAMPING
 
 #: The length of a residual that nobody asks for, pixels.
 FLOOR_PX = 1e-9
@@ -123,8 +123,8 @@ class NormalEquations:
         solved = np.linalg.solve(blocks, sides)
         back, alone = solved[:, :, :-1], solved[:, :, -1]
         n_shared = len(self.shared)
-        mixed = self.mixed.reshape(-1, n_shared)
-        information = self.shared - mixed.T @ back.reshape(-1, n_shared)
+        mixed = self.mixed.reshape(alone.size, n_shared)
+        information = self.shared - mixed.T @ back.reshape(alone.size, n_shared)
         information = (information + information.T) / 2.0
         information[np.diag_indices(n_shared)] += damping * np.diag(self.shared)
         return Reduced(information, self.shared_right - mixed.T @ alone.ravel(), back, alone)
