@@ -226,7 +226,7 @@ def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
     return Adjusted(
         adjusted.bundle,
         _by_view(adjusted.bundle, groups, adjusted.residuals),
-        found.normal.reduced().information,
+        problem.normal_equations(adjusted).reduced().information,
         layout,
         found.n_steps,
     )

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 State = TypeVar("State")
-Equations_co = TypeVar("Equations_co", bound="NormalEquations", covariant=True)
 
 #: Marquardt's damping: each diagonal is raised by this share; less after a step that serves, more
 #: after one that does not.
@@ -150,13 +149,13 @@ class NormalEquations:
         return float(max(of_shared.max(initial=0.0), of_blocks.max(initial=0.0)))
 
 
-class Problem(Protocol[State, Equations_co]):
+class Problem(Protocol[State]):
     """What is to be adjusted."""
 
     def cost(self, state: State) -> float:
         """Return the (robust) sum of squares; NaN or infinite where nothing can be fitted."""
 
-    def normal_equations(self, state: State) -> Equations_co:
+    def normal_equations(self, state: State) -> NormalEquations:
         """Return the problem as it looks from nearby."""
 
     def moved(self, state: State, step: Step) -> State | None:
@@ -183,7 +182,7 @@ class Stopping:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Minimum(Generic[State, Equations_co]):
+class Minimum(Generic[State]):
     """Where the sum of squares is least.
 
     Attributes
@@ -192,31 +191,28 @@ class Minimum(Generic[State, Equations_co]):
         What was adjusted.
     cost : float
         Its (robust) sum of squares.
-    normal : NormalEquations
-        As it looks from there.
     n_steps : int
         Steps that were tried.
     """
 
     state: State
     cost: float
-    normal: Equations_co
     n_steps: int
 
 
-def minimized(
-    problem: Problem[State, Equations_co], start: State, stopping: Stopping
-) -> Minimum[State, Equations_co]:
+def minimized(problem: Problem[State], start: State, stopping: Stopping) -> Minimum[State]:
     """Return the minimum that lies downhill of a start.
 
     The cost never rises; of a step that would raise it a shorter one is tried, unless the step was
     so short that rounding alone decides.
     """
     state, cost, damping = start, problem.cost(start), _FIRST_DAMPING
-    normal = problem.normal_equations(state)
+    normal: NormalEquations | None = None
     n_steps = 0
     while n_steps < stopping.max_steps and damping < _MOST_DAMPING:
         n_steps += 1
+        if normal is None:
+            normal = problem.normal_equations(state)
         step = normal.step(damping)
         enough = stopping.share * cost + stopping.floor
         is_last = normal.length_of(step) ** 2 <= enough
@@ -224,14 +220,13 @@ def minimized(
         moved_cost = np.inf if moved is None else problem.cost(moved)
         if moved is not None and moved_cost <= cost:  # False for NaN
             is_last |= cost - moved_cost <= enough
-            state, cost = moved, moved_cost
-            normal = problem.normal_equations(state)
+            state, cost, normal = moved, moved_cost, None
             damping = max(damping / _DAMPING_FACTOR, _LEAST_DAMPING)
         else:
             damping *= _DAMPING_FACTOR
         if is_last:
             break
-    return Minimum(state, cost, normal, n_steps)
+    return Minimum(state, cost, n_steps)
 
 
 # --- Soft L1 ----------------------------------------------------------------------------------

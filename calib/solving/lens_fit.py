@@ -451,14 +451,15 @@ def adjust_lens(
     problem = _LensProblem(batch.only(mask), mask, loss_px, free, move_poses)
     stopping = Stopping(max_steps, tolerance, max(1, mask.sum()) * FLOOR_PX**2)
     found = minimized(problem, problem.projected(camera, poses), stopping)
-    reduced = found.normal.reduced()
-    yielded = np.einsum("vip,vi->vp", reduced.back, found.normal.blocks_right)
+    normal = problem.normal_equations(found.state)
+    reduced = normal.reduced()
+    yielded = np.einsum("vip,vi->vp", reduced.back, normal.blocks_right)
     return LensAdjustment(
         found.state.camera,
         found.state.poses,
         found.cost,
         reduced.information,
-        found.normal.pulls - yielded,
+        normal.pulls - yielded,
     )
 
 
