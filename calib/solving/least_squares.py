@@ -15,6 +15,7 @@ parameters*, SIAM J. Appl. Math. 11(2), 1963; Nocedal and Wright, *Numerical opt
 synthesis*, 2000, sections 4.3 (robust loss) and 6.1 (Schur complement).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Protocol, Self, TypeVar
 
@@ -200,11 +201,27 @@ class Minimum(Generic[State]):
     n_steps: int
 
 
-def minimized(problem: Problem[State], start: State, stopping: Stopping) -> Minimum[State]:
+def minimized(
+    problem: Problem[State],
+    start: State,
+    stopping: Stopping,
+    seen_from: Callable[[State], Problem[State]] | None = None,
+) -> Minimum[State]:
     """Return the minimum that lies downhill of a start.
 
     The cost never rises; of a step that would raise it a shorter one is tried, unless the step was
     so short that rounding alone decides.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is adjusted.
+    start : State
+        Where from.
+    stopping : Stopping
+        When it is good enough.
+    seen_from : callable, optional
+        Returns the problem as it looks from where a step led, if its loss follows the residuals.
     """
     state, cost, damping = start, problem.cost(start), _FIRST_DAMPING
     normal: NormalEquations | None = None
@@ -221,6 +238,9 @@ def minimized(problem: Problem[State], start: State, stopping: Stopping) -> Mini
         if moved is not None and moved_cost <= cost:  # False for NaN
             is_last |= cost - moved_cost <= enough
             state, cost, normal = moved, moved_cost, None
+            if seen_from is not None:
+                problem = seen_from(state)
+                cost = problem.cost(state)
             damping = max(damping / _DAMPING_FACTOR, _LEAST_DAMPING)
         else:
             damping *= _DAMPING_FACTOR
