@@ -1,5 +1,6 @@
 # make demo    the whole job on a generated session
 # make test    everything that must hold: style, types, import contracts, tests
+# make quick   a minute of the tests: of each one that is quick the first case
 # make soak    the property tests with new examples: RUNS=10 times, SEED=1 and up, TESTS=some files
 # make bench   the benchmarks at full size, into tests/benchmarks/results.json; ONLY="bench_query" some
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
@@ -8,7 +9,7 @@
 
 BIN := .venv/bin
 
-.PHONY: demo test check pytest soak bench theory hard-cases lock setup clean
+.PHONY: demo test check pytest quick soak bench theory hard-cases lock setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -25,6 +26,9 @@ check: setup
 # Property tests are asked the same examples in every run, on every machine.
 pytest: setup
 	$(BIN)/pytest -n auto --dist loadfile --benchmark-disable
+
+quick: setup
+	$(BIN)/pytest -q -n auto --dist loadfile --benchmark-disable --quick
 
 # New examples, a seed a round: RUNS rounds (1), seeds from SEED up (drawn), of the tests in TESTS
 # (all that draw). The first round that is red ends it, and says how to repeat just that round.

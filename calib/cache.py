@@ -16,7 +16,6 @@ import hashlib
 import io
 import logging
 import os
-import tempfile
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -24,6 +23,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hybridve.calib.files import appearing
 
 _log = logging.getLogger(__name__)
 
@@ -103,15 +104,9 @@ def keep_arrays(kind: str, key: str, **arrays: NDArray[Any]) -> None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # The new name differs for each writer: two processes may compute the same.
-        descriptor, partial = tempfile.mkstemp(prefix=f"{key}.npz.", dir=folder)
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(packed.getbuffer())
-            Path(partial).replace(folder / f"{key}.npz")
-        except BaseException:
-            Path(partial).unlink(missing_ok=True)
-            raise
+        # Two processes may compute the same.
+        with appearing(folder / f"{key}.npz", is_contended=True) as partial:
+            partial.write_bytes(packed.getbuffer())
         _drop_oldest(folder)
     except OSError as error:
         _log.info("%s: nothing is kept for the next start: %s", folder, error)

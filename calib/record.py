@@ -9,14 +9,12 @@ adds a field adds it here, and where it is a doubt to `CalibrationRecord.doubts`
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-from hybridve.calib.plain import Told, read_strictly, to_plain
+from hybridve.calib.plain import Told
 
-#: By these a record is known to be of this program: either suffices.
 METHOD: Final = "joint bundle adjustment of lenses, poses and boards"
-_PROGRAM = "hybridve"
 
 #: Decided by what cameras recognise around a still board that looks the same when turned.
 BY_SCENE = "matches of the scene"
@@ -26,6 +24,11 @@ _WEAK_LABELLING = (
     "camera saw it; mark the corners by hand in one order, move the board, or use one with "
     "an odd sum of columns and rows."
 )
+
+#: A difference beyond the stated error is no chance from so many standard deviations on, and no
+#: rounding if images differ by more than this (pixels): points without noise state next to none.
+_DISAGREES_SIGMAS = 4.0
+_NEGLIGIBLE_PX = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -392,6 +395,9 @@ class Adjustment(Told):
         Views that contradict the others, and why.
     warnings : tuple of str
         What was found to contradict itself: doubts.
+    start : str or None
+        What it started from, in words, and if not from COLMAP's adjustment why; None in older
+        files.
     """
 
     steps: int
@@ -400,6 +406,63 @@ class Adjustment(Told):
     worst_outliers: tuple[Outlier, ...]
     left_out: dict[str, str]
     warnings: tuple[str, ...]
+    start: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NoOpinion(Told):
+    """That there is no second opinion on a rig, and why, as a sentence.
+
+    Attributes
+    ----------
+    reason : str
+    """
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecondOpinion(Told):
+    """By how much COLMAP's own adjustment of the same points differs from a rig.
+
+    Attributes
+    ----------
+    difference95_m : float
+        How far apart the two place a point that both see, but for the 5 % of the working volume
+        where they differ most.
+    expected95_m : float
+        The same for the stated error (95 %) of COLMAP's adjustment, for the noise that was found:
+        chance makes the two differ by less.
+    sigmas : float
+        The difference in standard deviations of that error.
+    difference95_px : float
+        How far apart the two see a point, in the camera where they differ most.
+    """
+
+    difference95_m: float
+    expected95_m: float
+    sigmas: float
+    difference95_px: float
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the difference is beyond the stated error, and neither chance nor rounding."""
+        return (
+            self.difference95_m > self.expected95_m
+            and self.sigmas > _DISAGREES_SIGMAS
+            and self.difference95_px > _NEGLIGIBLE_PX
+        )
+
+    @property
+    def doubt(self) -> str:
+        """What a difference leaves open, in words."""
+        return (
+            "COLMAP's own adjustment of the same points places what the cameras see "
+            f"{1000 * self.difference95_m:.2f} mm elsewhere, which is {self.sigmas:.1f} standard "
+            f"deviations and beyond its stated error ({1000 * self.expected95_m:.2f} mm): one of "
+            "the two is wrong, or the noise of stills and clip is not what it was taken for; "
+            "compare a distance you know."
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -432,6 +495,8 @@ class CalibrationRecord(Told):
         How it was done, as plain JSON values.
     adjustment : Adjustment or None
         None where all cameras move.
+    second_opinion : SecondOpinion, NoOpinion or None
+        None where all cameras move, and in older files.
 
     Raises
     ------
@@ -451,6 +516,7 @@ class CalibrationRecord(Told):
     world: WorldRecord | None = None
     settings: dict[str, dict[str, Any]]
     adjustment: Adjustment | None = None
+    second_opinion: SecondOpinion | NoOpinion | None = None
 
     def __post_init__(self) -> None:
         still = [camera for camera in self.cameras.values() if camera.mount is None]
@@ -459,6 +525,9 @@ class CalibrationRecord(Told):
         for name in ("world", "adjustment"):
             if getattr(self, name) is None:
                 raise ValueError(f"{name!r} is missing, though cameras stand still")
+        is_new = self.adjustment is not None and self.adjustment.start is not None
+        if is_new and self.second_opinion is None:
+            raise ValueError("'second_opinion' is missing, though cameras stand still")
         lay_still = all(one.extrinsics.other_tilt_times_worse is not None for one in still)
         if lay_still and self.labelling is None:
             raise ValueError("'labelling' is missing, though the boards lay still")
@@ -473,7 +542,12 @@ class CalibrationRecord(Told):
         """What contradicted itself or could not be decided, in words: no gate may pass it."""
         contradictions = () if self.adjustment is None else self.adjustment.warnings
         undecided = self.labelling is not None and self.labelling.is_weak
-        return (*contradictions, *([_WEAK_LABELLING] if undecided else []))
+        other = self.second_opinion
+        return (
+            *contradictions,
+            *([_WEAK_LABELLING] if undecided else []),
+            *([other.doubt] if isinstance(other, SecondOpinion) and other.disagrees else []),
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -484,50 +558,3 @@ class CalibrationRecord(Told):
         """Return the record with cameras called anew; those without a new name keep theirs."""
         cameras = {names.get(name, name): told for name, told in self.cameras.items()}
         return replace(self, cameras=cameras)
-
-
-@dataclass(frozen=True, slots=True)
-class MadeElsewhere:
-    """A rig that this program did not calibrate: what was decided or doubted is not known.
-
-    Attributes
-    ----------
-    told : dict
-        What its file says of where it comes from, as plain JSON values; nobody relies on it.
-    """
-
-    told: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def format(self) -> str:
-        """The format that it was read from, as far as known: a rig.json unless told otherwise."""
-        return str(self.told.get("format", "json"))
-
-
-Provenance = CalibrationRecord | MadeElsewhere
-
-
-# --- As JSON ----------------------------------------------------------------------------------
-
-
-def provenance_to_plain(provenance: Provenance) -> dict[str, Any]:
-    """Return what stands in a rig.json; what a foreign rig told is passed on as it was."""
-    if isinstance(provenance, MadeElsewhere):
-        return provenance.told
-    plain: dict[str, Any] = to_plain(provenance)
-    return plain
-
-
-def provenance_from_plain(told: Mapping[str, Any]) -> Provenance:
-    """Return what stands in a rig.json, typed.
-
-    Raises
-    ------
-    CalibrationError
-        If it is a record of this program, but not complete.
-    """
-    software = told.get("software")
-    is_ours = isinstance(software, Mapping) and _PROGRAM in software
-    if not is_ours and told.get("method") != METHOD:
-        return MadeElsewhere(dict(told))
-    return read_strictly(CalibrationRecord, told, "provenance")

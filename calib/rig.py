@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose, compose, invert
-from hybridve.calib.record import MadeElsewhere, Provenance
+from hybridve.calib.provenance import MadeElsewhere, Provenance
 from hybridve.calib.verdict import RigTest
 
 #: The names of a camera's pose parameters, in the order in which a covariance has them.

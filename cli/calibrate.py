@@ -205,7 +205,7 @@ def _calibrate(
     as_json: bool,
 ) -> None:
     from hybridve.calib.formats.colmap import write_colmap_model
-    from hybridve.calib.formats.rigs import write_rig
+    from hybridve.calib.formats.rig_json import write_rig
     from hybridve.calib.judging.certificate import SeenPoints, certify, working_volume
     from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
     from hybridve.hull.report.write import refuse_existing
@@ -218,7 +218,7 @@ def _calibrate(
     if session.rig_file is not None:
         rig = take_elsewhere(session, terminal.stage)
     else:
-        calibration = calibrate_session(session, terminal.stage)
+        calibration = calibrate_session(session, terminal.stage, box_world)
         rig = calibration.rig
         volume = working_volume(rig, box_world)
         seen = {
@@ -249,10 +249,16 @@ def _write_certificate(
     max_error_m: float | None,
     with_page: bool,
 ) -> None:
+    from hybridve.calib.errors import CalibrationError
+    from hybridve.calib.files import appearing
+
     text = json.dumps(certificate.to_dict(), indent=1, allow_nan=False) + "\n"
-    partial = folder / "certificate.json.partial"
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(folder / "certificate.json")
+    path = folder / "certificate.json"
+    try:
+        with appearing(path) as partial:
+            partial.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written: {error}") from error
     page = folder / "certificate.html"
     if not with_page:
         page.unlink(missing_ok=True)  # one of an older rig would be believed
@@ -336,7 +342,7 @@ def _distances_m(rig: "Rig") -> dict[str, float]:
 
 
 def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
-    from hybridve.calib.judging.certificate import millimetres
+    from hybridve.calib.judging.certificate import millimetres, opinion_text
 
     record = _record_of(rig)
     if certificate is not None:
@@ -366,6 +372,8 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
     if rig.check is not None:
         click.echo(f"  {rig.check.message}")
     if certificate is not None:
+        if certificate.second_opinion is not None:
+            click.echo(f"  {opinion_text(certificate.second_opinion)}")
         for warning in certificate.warnings:
             click.echo(f"  {warning}")
 

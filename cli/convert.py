@@ -28,9 +28,9 @@ class ImageSize(click.ParamType[tuple[int, int]]):
         if not isinstance(value, str):
             return value
         width, _, height = value.lower().partition("x")
-        if width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0:
-            return int(width), int(height)
-        self.fail(f"{value!r} is not a size; expected 1920x1080", param, ctx)
+        if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+            self.fail(f"{value!r} is not a size; expected 1920x1080", param, ctx)
+        return int(width), int(height)
 
 
 @click.command(short_help="Take a rig from one program's files to another's.")
@@ -100,7 +100,8 @@ def convert(
       hybridve convert rig/rig.json --to kalibr -o camchain.yaml
       hybridve convert '{camera}/config.xml' --from-unit mm --to colmap -o sparse
     """
-    from hybridve.calib.formats.rigs import export_rig, output_files, read_any_rig
+    from hybridve.calib.formats.rig_export import export_rig, output_files
+    from hybridve.calib.formats.rigs import read_any_rig
     from hybridve.hull.report.write import refuse_existing
 
     found = read_any_rig(

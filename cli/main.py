@@ -27,7 +27,7 @@ _INTERRUPTED = 130
 class _InOrder(click.Group):
     """Lists commands in the order of the work, not of the alphabet."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  # click's
         return list(self.commands)
 
 

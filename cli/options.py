@@ -12,7 +12,7 @@ EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 if TYPE_CHECKING:
     from hybridve.hull.capture.recording import FrameRange
     from hybridve.hull.chain import EvaluateSettings
-    from hybridve.hull.contact.uncertainty import DoubtSettings
+    from hybridve.hull.contact.outline_errors import DoubtSettings
 
 FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
 
@@ -207,7 +207,7 @@ def doubt_of(*, doubt: bool, mask_std_px: float | None) -> "DoubtSettings | None
     """Return what the options of `doubt_options` ask to assume of outlines; None for no doubt."""
     if not doubt:
         return None
-    from hybridve.hull.contact.uncertainty import DoubtSettings
+    from hybridve.hull.contact.outline_errors import DoubtSettings
 
     return DoubtSettings() if mask_std_px is None else DoubtSettings(segmentation_px=mask_std_px)
 

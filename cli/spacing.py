@@ -144,9 +144,8 @@ def spacing(
     from hybridve.hull.capture.session import load_session
     from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
     from hybridve.hull.report.compare import distinct_names
-    from hybridve.hull.report.machine import machine_text, software_versions
+    from hybridve.hull.report.machine import Run
     from hybridve.hull.report.spacing_file import Spacing, spacing_as_dict, write_spacing
-    from hybridve.hull.report.sweep_file import utc_now
     from hybridve.hull.report.write import refuse_existing
     from hybridve.hull.spacing import Layout, replay, shifts_of, write_picture_of
     from hybridve.hull.view.chart import SUFFIXES
@@ -190,10 +189,7 @@ def spacing(
                 )
             )
     result = Spacing(
-        command=options.command_line(),
-        machine=machine_text(),
-        created_utc=utc_now(),
-        versions=software_versions(),
+        run=Run.now(options.command_line()),
         settings={
             "scene": str(loaded_scene.path),
             "scene_sha256": loaded_scene.checksum,

@@ -141,12 +141,11 @@ def sweep(
     from hybridve.hull.chain import EvaluateSettings, count_frames, make_chain
     from hybridve.hull.query.certify import certify_triangles
     from hybridve.hull.query.choose import open_engine
-    from hybridve.hull.report.machine import machine_text, software_versions
+    from hybridve.hull.report.machine import Run
     from hybridve.hull.report.sweep_file import (
         Sweep,
         read_sweep,
         sweep_as_dict,
-        utc_now,
         write_sweep,
     )
     from hybridve.hull.report.write import refuse_existing
@@ -212,10 +211,7 @@ def sweep(
     write_sweep(
         output,
         Sweep(
-            command=options.command_line(),
-            machine=machine_text(),
-            created_utc=utc_now(),
-            versions=software_versions(),
+            run=Run.now(options.command_line()),
             settings={
                 **resolved_settings(chain),
                 "viewports": list(viewports),

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridve.calib.formats.rigs import rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.schema import Part
 

@@ -23,7 +23,7 @@ from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.choose import open_engine
 from hybridve.hull.query.engine import EngineName
 from hybridve.hull.report.compare import Pair, report_name
-from hybridve.hull.report.machine import machine_text, software_versions
+from hybridve.hull.report.machine import Run
 from hybridve.hull.report.read import read_report
 from hybridve.hull.report.schema import ReportHeader
 from hybridve.hull.report.summarize import summarize
@@ -74,7 +74,7 @@ def write_report(chain: Chain, output: Path, settings: DetectSettings, watcher: 
     """Evaluate a chain into a report; where one was cut off and is taken up, what is missing."""
     with open_engine(settings.engine) as engine:
         header = ReportHeader(
-            command=settings.command,
+            run=Run.now(settings.command),
             objects=about_objects(chain),
             settings=resolved_settings(chain),
             rig=about_rig(chain),
@@ -82,8 +82,6 @@ def write_report(chain: Chain, output: Path, settings: DetectSettings, watcher: 
             renderer=engine.renderer,
             parts=computed_parts(chain.settings),
             cameras=chain.views.names,
-            versions=software_versions(),
-            machine=machine_text(),
             local_origin_m=local_origin_m(chain),
             meshes=stored_meshes(chain),
             points=settings.points,

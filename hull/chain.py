@@ -49,7 +49,8 @@ from hybridve.hull.query.silhouettes import (
 )
 
 if TYPE_CHECKING:
-    from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings
+    from hybridve.hull.contact.outline_errors import DoubtSettings
+    from hybridve.hull.contact.uncertainty import Doubter
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,7 +323,8 @@ def make_doubter(chain: Chain) -> "Doubter | None":
     if chain.settings.doubt is None:
         return None
     # Late: it brings scipy's optimisers, for which a picture or a sweep need not wait.
-    from hybridve.hull.contact.uncertainty import Doubter, outline_errors
+    from hybridve.hull.contact.outline_errors import outline_errors
+    from hybridve.hull.contact.uncertainty import Doubter
 
     names, shift_px = chain.views.names, mask_shift_px(chain)
     errors = outline_errors(

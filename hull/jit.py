@@ -7,6 +7,8 @@ the first time (see `hybridve.hull.prepare`). Division by zero gives infinity, a
 numba notices when the file of a function changes, but not when a function that it calls does, in
 another file. So what is kept lies in a folder named after all sources that are compiled, in
 ``compiled`` of the cache (see `hybridve.calib.cache`), or in ``NUMBA_CACHE_DIR`` where that is set.
+To load this module reads the sources, and makes nothing; the folder is opened for the first
+function that is called.
 """
 
 import hashlib
@@ -16,12 +18,14 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import llvmlite.binding
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache, NullCache
 
 from hybridve.calib.cache import cache_folder
 
@@ -34,16 +38,17 @@ _FORGOTTEN_AFTER_S = 30 * 24 * 3600.0
 _DIGITS = 16
 
 
-def open_folder() -> Path | None:
+def open_folder(name: str | None = None) -> Path | None:
     """Return the folder of compiled code for these sources on this machine; None for none.
 
     It is made where there is none. Folders of other sources that are not used any more go then.
+    Its name is that of the sources as they stand, unless another is given.
     """
     users = numba.config.CACHE_DIR
     base = Path(users) if users else cache_folder("compiled")
     if base is None:
         return None
-    folder = base / _digest()
+    folder = base / (name or _digest())
     try:
         if not folder.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
@@ -78,10 +83,31 @@ def _drop_forgotten(base: Path) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-#: Where compiled code is kept, or None.
-FOLDER = open_folder()
-if FOLDER is not None:
-    numba.config.CACHE_DIR = str(FOLDER)
+#: The sources as they are loaded: what is compiled later is of these, whatever stands there then.
+_LOADED = _digest()
+
+
+@cache
+def folder() -> Path | None:
+    """Return where this program keeps compiled code, or None; the folder is there from now on."""
+    opened = open_folder(_LOADED)
+    if opened is not None:
+        numba.config.CACHE_DIR = str(opened)
+    return opened
+
+
+class _KeptCode:
+    """What is kept of one function's compiled code; no folder is touched before it is asked for."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._code: Any = None
+
+    def __getattr__(self, name: str) -> Any:
+        if self._code is None:
+            self._code = NullCache() if folder() is None else FunctionCache(self._function)
+        return getattr(self._code, name)
+
 
 #: A zero to begin counts with. For one written out, numba compiles what takes it a second time.
 ZERO = cast(int, np.int64(0))
@@ -98,8 +124,9 @@ def inlined(function: _Function) -> _Function:
 
 
 def _compile(function: _Function, **options: bool) -> _Function:
-    keep = FOLDER is not None
-    dispatcher = numba.njit(
-        cache=keep, nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options
-    )(function)
+    dispatcher = numba.njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", **options)(
+        function
+    )
+    # numba's own would make the folder here, whether or not anything is ever compiled.
+    dispatcher._cache = _KeptCode(function)
     return cast("_Function", dispatcher)

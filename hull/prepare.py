@@ -21,7 +21,7 @@ from hybridve.hull.contact.components import connected_volumes
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
 from hybridve.hull.contact.patches import contact_patches
 from hybridve.hull.contact.respond import collision_point
-from hybridve.hull.jit import FOLDER
+from hybridve.hull.jit import folder
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Views, make_hull, make_views
@@ -39,12 +39,14 @@ _SIGN = "complete"
 
 def is_prepared() -> bool:
     """Tell whether all is compiled and kept."""
-    return FOLDER is not None and (FOLDER / _SIGN).exists()
+    kept = folder()
+    return kept is not None and (kept / _SIGN).exists()
 
 
 def prepare_kernels() -> bool:
     """Compile all that ``detect`` needs and keep it; tell whether it is kept."""
-    if FOLDER is not None and not is_prepared():
+    kept = folder()
+    if kept is not None and not is_prepared():
         # The compiler leaves little that only a collection would free: a tenth of the time.
         collects = gc.isenabled()
         gc.disable()
@@ -53,8 +55,8 @@ def prepare_kernels() -> bool:
         finally:
             if collects:
                 gc.enable()
-        held = sorted(str(path.relative_to(FOLDER)) for path in FOLDER.rglob("*.nbc"))
-        (FOLDER / _SIGN).write_text("\n".join(held) + "\n", encoding="utf-8")
+        held = sorted(str(path.relative_to(kept)) for path in kept.rglob("*.nbc"))
+        (kept / _SIGN).write_text("\n".join(held) + "\n", encoding="utf-8")
     return is_prepared()
 
 

@@ -44,7 +44,7 @@ class Nobody:
         self, what: str, total: int, *, done: int = 0, unit: str = "frame"
     ) -> AbstractContextManager[Advance]:
         """Show nothing."""
-        return nullcontext(lambda n=1: None)
+        return nullcontext(lambda n=1: None)  # noqa: ARG005
 
     def say(self, text: str) -> None:
         """Show nothing."""

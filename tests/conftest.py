@@ -13,6 +13,10 @@ from hypothesis.internal.conjecture import providers
 from hybridve.calib.cache import cache_folder
 
 PROJECT = Path(__file__).resolve().parent.parent
+BENCHMARKS = PROJECT / "tests" / "benchmarks"
+
+#: The marks of what --quick leaves out.
+_NOT_QUICK = ("slow", "recording", "hypothesis")
 
 # A property test is asked the same examples in every run, on every machine: what is red for one is
 # red for all. Nothing is kept from run to run either. Machines are noisy, and compiled code
@@ -38,6 +42,23 @@ providers.is_local_module_file = lambda path: False  # type: ignore[assignment]
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Benchmarks run at their smallest unless they are asked for what is published."""
     parser.addoption("--full", action="store_true", help="benchmarks: all cases, at full size")
+    parser.addoption("--quick", action="store_true", help="of each quick test the first case")
+
+
+@pytest.hookimpl(trylast=True)  # once hypothesis has marked what it draws
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """With --quick leave out what takes long, recordings, drawn examples, and all but one case."""
+    if not config.getoption("--quick"):
+        return
+    quick: dict[str, pytest.Item] = {}
+    for item in items:
+        if not any(item.get_closest_marker(name) for name in _NOT_QUICK) and not (
+            item.path.is_relative_to(BENCHMARKS)
+        ):
+            quick.setdefault(item.nodeid.partition("[")[0], item)
+    kept = set(quick.values())
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = [item for item in items if item in kept]
 
 
 def pytest_configure(config: pytest.Config) -> None:

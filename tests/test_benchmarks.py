@@ -35,6 +35,7 @@ SCRIPTS = [path for path in results.FILES if results.is_script(path)]
 OTHERS = [path for path in results.FILES if not results.is_script(path)]
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_a_script_runs_at_its_smallest_and_returns_numbers(

@@ -202,6 +202,7 @@ def closed_parts(folder: Path) -> list[tuple[str, Mesh, NDArray[np.int32]]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_real_parts_have_the_sides_that_solid_angles_have(recordings: Path) -> None:
     """Thousands of points in, about and a hair from all closed parts, none on the wrong side."""

@@ -478,7 +478,7 @@ def test_meshes_outside_the_scene_are_said(tmp_path: Path) -> None:
     assert len(cad.parts) == 1
 
 
-def test_a_glb_cut_off_anywhere_is_refused_and_so_is_more(tmp_path: Path) -> None:
+def test_a_glb_cut_off_anywhere_is_refused_and_so_is_more() -> None:
     content = square_gltf().glb()
 
     for end in range(len(content)):
@@ -867,6 +867,7 @@ def test_binary_stl_is_what_open3d_reads_to_the_bit(recordings: Path) -> None:
         np.testing.assert_array_equal(corners(path), triangles, strict=True)
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 @pytest.mark.parametrize(
     ("step", "stl", "stl_unit_m", "volume"),

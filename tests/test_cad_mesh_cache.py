@@ -358,6 +358,7 @@ def test_a_mesh_that_is_refused_is_not_kept(folder: Path, tmp_path: Path) -> Non
     assert entries(folder) == []
 
 
+@pytest.mark.slow
 def test_a_second_detect_does_without_the_readers(folder: Path, tmp_path: Path) -> None:
     session = write_ball_session(tmp_path, np.zeros((1, 3)))
     scene = write_cube_scene(tmp_path, {"part": (0.0, 0.0, 150.0)})

@@ -486,6 +486,7 @@ def test_a_gap_narrower_than_the_tolerance_is_found_so() -> None:
 # --- real files -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_real_files_hold_what_independent_readers_find(recordings: Path) -> None:
     """Every STL, OBJ and PLY: vertices by VTK, area and count of triangles by trimesh or VTK."""

@@ -107,6 +107,7 @@ def test_the_torus_of_many_facets_has_the_volume_of_the_torus() -> None:
     assert found.volume == pytest.approx(2 * np.pi**2 * 3.0, rel=5e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mesh", "volume"), SOLIDS)
 @given(data=st.data())
 def test_one_triangle_decides(mesh: Mesh, volume: float, data: st.DataObject) -> None:

@@ -130,7 +130,7 @@ def test_a_full_disk_leaves_no_trace(folder: Path, monkeypatch: pytest.MonkeyPat
     def no_space(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(cache.os, "fdopen", no_space)
+    monkeypatch.setattr(Path, "write_bytes", no_space)
 
     keep(cache_key("a"))
 

@@ -26,10 +26,10 @@ from hybridve.calib.boards.target import Chessboard, find_corners
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
 from hybridve.calib.image_io import open_source
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.record import provenance_from_plain
+from hybridve.calib.provenance import provenance_from_plain
 from hybridve.calib.rig import Rig
 from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 
@@ -101,12 +101,14 @@ def rig(recorded: Path) -> Rig:
     return calibrate_rig([BOARD], inputs(recorded), SETTINGS).rig
 
 
+@pytest.mark.slow
 def test_pictures_give_the_rig(rig: Rig) -> None:
     for camera in two_cameras():
         distance_m = np.linalg.norm(rig[camera.name].center_world - camera.center_world)
         assert distance_m < PLACED * np.linalg.norm(camera.center_world)
 
 
+@pytest.mark.slow
 def test_the_provenance_is_plain_json_and_says_what_was_used(rig: Rig) -> None:
     told = json.loads(json.dumps(rig_to_dict(rig), allow_nan=False))["provenance"]
 
@@ -143,6 +145,7 @@ def write_marks(path: Path, corners: NDArray[np.float64]) -> None:
     path.write_text("x,y\n" + "\n".join(lines) + "\n")
 
 
+@pytest.mark.slow
 def test_corners_marked_by_hand_serve_where_none_are_found(
     recorded: Path, hidden_row: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -162,6 +165,7 @@ def test_corners_marked_by_hand_serve_where_none_are_found(
     assert distance_m < 3 * PLACED * np.linalg.norm(camera.center_world)
 
 
+@pytest.mark.slow
 def test_a_camera_without_board_or_marks_is_named_with_what_was_tried(
     recorded: Path, hidden_row: Path
 ) -> None:
@@ -209,6 +213,7 @@ def around(board: Chessboard) -> list[Camera]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [SYMMETRIC, Chessboard(6, 6, 0.1)])
 def test_the_floor_around_it_tells_which_way_round_a_board_was_seen(board: Chessboard) -> None:
     cameras = around(board)
@@ -223,6 +228,7 @@ def test_the_floor_around_it_tells_which_way_round_a_board_was_seen(board: Chess
     assert len(evidence.matches_by_look["cam1 cam2"]) == len(board.looks)
 
 
+@pytest.mark.slow
 def test_without_anything_around_it_the_doubt_is_said(caplog: pytest.LogCaptureFixture) -> None:
     cameras = around(SYMMETRIC)
     observations = seen_on_a_floor(SYMMETRIC, cameras, textured=False)
@@ -234,6 +240,7 @@ def test_without_anything_around_it_the_doubt_is_said(caplog: pytest.LogCaptureF
     assert any("uncertain" in record.message for record in caplog.records)
 
 
+@pytest.mark.slow
 def test_marks_in_one_order_decide_where_the_scene_is_bare() -> None:
     cameras = around(SYMMETRIC)
     observations = seen_on_a_floor(SYMMETRIC, cameras, textured=False)
@@ -254,6 +261,7 @@ def test_marks_in_one_order_decide_where_the_scene_is_bare() -> None:
 # --- Bad input --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_unknown_camera_model_is_named(recorded: Path) -> None:
     with pytest.raises(
         CalibrationError, match=r"'left': unknown camera model 'GOPRO'; one of .*OP"
@@ -261,6 +269,7 @@ def test_an_unknown_camera_model_is_named(recorded: Path) -> None:
         calibrate_rig([BOARD], inputs(recorded, model="GOPRO"))
 
 
+@pytest.mark.slow
 def test_a_camera_named_twice_is_refused(recorded: Path) -> None:
     with pytest.raises(CalibrationError, match="'same' is listed 2 times"):
         calibrate_rig([BOARD], inputs(recorded, name="same"))
@@ -271,11 +280,13 @@ def test_no_camera_is_refused() -> None:
         calibrate_rig([BOARD], [])
 
 
+@pytest.mark.slow
 def test_a_camera_without_a_common_clip_is_named(recorded: Path) -> None:
     with pytest.raises(CalibrationError, match="'left': no clip"):
         calibrate_rig([BOARD], inputs(recorded, extrinsics=None))
 
 
+@pytest.mark.slow
 def test_stills_without_the_board_are_counted(recorded: Path) -> None:
     only_bare = replace(inputs(recorded)[0], intrinsics=open_source(recorded, "left/stills/3.png"))
 

@@ -15,8 +15,10 @@ from hybridve.calib.boards.board import Board, Observations, Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.judging.check import SCALE_TOLERANCE, SIGNIFICANCE, check_rig
+from hybridve.calib.judging.case import SIGNIFICANCE
+from hybridve.calib.judging.check import check_rig
 from hybridve.calib.judging.comparison import chance_of
+from hybridve.calib.judging.wording import SCALE_TOLERANCE
 from hybridve.calib.pose import compose, moved_pose, rotation_about_axes
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import adjust
@@ -247,6 +249,7 @@ def exchanged(
     return {**seen, first: seen[second], second: seen[first]}
 
 
+@pytest.mark.slow
 def test_an_untouched_rig_is_accused_as_rarely_as_is_said() -> None:
     """At most SIGNIFICANCE of the rigs: of 15, one is accused once in 600 such tests."""
     checks = [
@@ -261,6 +264,7 @@ def test_an_untouched_rig_is_accused_as_rarely_as_is_said() -> None:
     assert 0.001 < min(values) < 0.5
 
 
+@pytest.mark.slow
 def test_a_camera_bumped_by_5_mm_and_a_third_of_a_degree_is_named() -> None:
     """In nearly all directions: what looks like an error that the rig states is not accused."""
     named, shifts_mm, turns_deg = 0, [], []
@@ -285,6 +289,7 @@ def test_a_camera_bumped_by_5_mm_and_a_third_of_a_degree_is_named() -> None:
     assert np.median(turns_deg) == pytest.approx(BUMP_DEG, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_rig_is_not_accused_of_errors_that_it_states_itself() -> None:
     """The same rig, shaken: with a covariance that allows for it, and with one that does not."""
     rig = calibrated(0)
@@ -308,6 +313,7 @@ def test_a_rig_is_not_accused_of_errors_that_it_states_itself() -> None:
     assert not examine(proud, [CALIBRATED], seen).is_trustworthy
 
 
+@pytest.mark.slow
 def test_several_bumped_cameras_are_named_with_how_far_they_moved() -> None:
     models = (*MODELS, "OPENCV")
     cameras = truth(models)
@@ -324,6 +330,7 @@ def test_several_bumped_cameras_are_named_with_how_far_they_moved() -> None:
     assert check.moved["cam4"].what == "pose"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("knows_its_errors", [True, False])
 @pytest.mark.parametrize("pair", [("cam1", "cam2"), ("cam1", "cam3"), ("cam3", "cam4")])
 def test_exchanged_cameras_are_named(pair: tuple[str, str], knows_its_errors: bool) -> None:
@@ -364,6 +371,7 @@ def test_a_zoom_is_told_from_a_move(n_cameras: int, knows_its_errors: bool, fact
     assert "another lens or zoom" in check.message
 
 
+@pytest.mark.slow
 def test_a_scale_beyond_the_stated_errors_is_told() -> None:
     rig = calibrated(3)
     assert rig.covariance is not None
@@ -386,6 +394,7 @@ def test_a_scale_beyond_the_stated_errors_is_told() -> None:
     assert unknown.is_trustworthy  # 5 % are allowed where errors are not known
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_and_sightings_does_not_matter() -> None:
     rig = calibrated(4)
     now = with_one(truth(), 2, bumped(truth()[2], 4, 20.0, 1.0))

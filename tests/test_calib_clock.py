@@ -98,6 +98,7 @@ def test_any_offset_is_found(late: float, other: float) -> None:
     assert estimate(out_of_time(true, 50)).offset_frames == pytest.approx(true, abs=EXACT_FRAMES)
 
 
+@pytest.mark.slow
 def test_the_stated_error_is_the_error() -> None:
     shares = []
     for seed in range(10):
@@ -198,6 +199,7 @@ def test_a_symmetric_board_tells_them_too() -> None:
     assert clocks.offset_frames == pytest.approx(LATE, abs=EXACT_FRAMES)
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_changes_no_bit() -> None:
     recording = out_of_time(LATE, 40, noise_px=0.2)
     late = CalibrationSettings(sync="estimate")
@@ -289,6 +291,7 @@ def test_corners_are_interpolated_only_between_neighbours() -> None:
     assert {28, 33} <= instants
 
 
+@pytest.mark.slow
 def test_a_rig_of_late_cameras_is_solved_with_the_noise_of_frames() -> None:
     late = {"cam1": 0.0, "cam2": 2.5}
     recording = out_of_time(late, 40, noise_px=0.2)

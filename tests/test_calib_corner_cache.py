@@ -3,6 +3,7 @@
 import os
 import shutil
 import time
+import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -193,7 +194,7 @@ def test_a_full_disk_leaves_no_trace(folder: Path, monkeypatch: pytest.MonkeyPat
     def no_space(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(corner_cache.os, "fdopen", no_space)
+    monkeypatch.setattr(zipfile.ZipFile, "writestr", no_space)
     cache = CornerCache(folder)
     cache.keep(("which",), ANSWER)
     cache.save()

@@ -79,6 +79,7 @@ def parameter_errors(rig: Rig) -> NDArray[np.float64]:
     )
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says_in_every_direction() -> None:
     """The mean squared error in units of the covariance is one a parameter (chi-squared)."""
     squares = []
@@ -93,6 +94,7 @@ def test_errors_are_as_large_as_the_covariance_says_in_every_direction() -> None
     assert np.sum(squares) / count == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / count) + 0.04)
 
 
+@pytest.mark.slow
 def test_points_are_placed_as_wrong_as_is_said() -> None:
     middle = BOARD.center_board
     points = middle + np.array([[0.0, 0.0, 0.1], [0.3, 0.1, 0.3], [-0.2, 0.2, 0.5]])
@@ -160,6 +162,7 @@ def assert_covariance(found: NDArray[np.float64], told: NDArray[np.float64], cou
     np.testing.assert_allclose(found / scale, told / scale, atol=5.0 / np.sqrt(count))
 
 
+@pytest.mark.slow
 def test_the_pixel_covariance_is_that_of_the_images_of_disturbed_rigs() -> None:
     _, rig = calibrations()[0]
     point = BOARD.center_board[None] + [[0.1, 0.1, 0.3]]
@@ -170,6 +173,7 @@ def test_the_pixel_covariance_is_that_of_the_images_of_disturbed_rigs() -> None:
     assert_covariance(np.cov(images.reshape(3000, 6).T), told, 3000)
 
 
+@pytest.mark.slow
 def test_the_same_holds_in_images_freed_of_distortion() -> None:
     _, rig = calibrations()[0]
     point = BOARD.center_board + np.array([0.6, 0.35, 0.2])  # where the lenses bend
@@ -264,6 +268,7 @@ def test_a_point_that_one_camera_sees_has_no_place() -> None:
     assert np.isnan(told.radius95_m[0])
 
 
+@pytest.mark.slow
 def test_a_world_found_by_the_cameras_shares_their_errors() -> None:
     """Points whose places are known define the world: errors of poses in it, over many seeds."""
     true = ring(BOARD, ["PINHOLE"] * 3)

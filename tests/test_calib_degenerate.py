@@ -21,7 +21,7 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.judging.certificate import Certificate, SeenPoints, certify, working_volume
 from hybridve.calib.lens import img_from_cam
@@ -321,6 +321,7 @@ def test_cameras_in_exactly_one_place_place_no_point() -> None:
     assert "no error in mm can be stated" in certificate.verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", DOUBTED)
 def test_a_recording_that_contradicts_itself_gives_a_rig_that_is_doubted(case: str) -> None:
     make, named = DOUBTED[case]
@@ -364,6 +365,7 @@ def assert_honest(
     assert worst_sigmas(calibration, certificate, true) < _CONFIDENTLY_WRONG
 
 
+@pytest.mark.slow
 def test_a_camera_upside_down_is_as_good_as_any() -> None:
     cameras = around()
     x, y, _ = LYING.center_board
@@ -400,6 +402,7 @@ def test_three_views_make_a_lens_that_is_as_unsure_as_it_says() -> None:
     assert two.place_std_m > 1.2 * one.place_std_m
 
 
+@pytest.mark.slow
 def test_a_board_in_a_corner_of_the_image_leaves_the_rest_unsure() -> None:
     camera = around()[1]
     poses = []
@@ -449,6 +452,7 @@ def test_a_still_clip_alone_serves_where_lenses_are_known() -> None:
     assert_honest(*calibrated([LYING], seen, requests=known), cameras)
 
 
+@pytest.mark.slow
 def test_a_board_that_nobody_shows_changes_nothing() -> None:
     alone = solve_rig([LYING], lying()).rig
     beside = solve_rig([LYING, Chessboard(9, 6, 0.05, name="another")], lying()).rig
@@ -511,6 +515,7 @@ def test_of_two_cameras_the_mirrored_one_cannot_be_told() -> None:
     assert_refused("'cam2' or of 'cam1' seems to be mirrored", [CARRIED], [one, mirrored(other)])
 
 
+@pytest.mark.slow
 def test_a_mirrored_board_of_markers_on_the_floor_puts_its_camera_below() -> None:
     seen = lying()
     seen[1] = mirrored(seen[1], are_points_named=True)
@@ -518,6 +523,7 @@ def test_a_mirrored_board_of_markers_on_the_floor_puts_its_camera_below() -> Non
     assert_refused("'cam2' .*came out under the floor: is its picture mirrored", [LYING], seen)
 
 
+@pytest.mark.slow
 def test_a_camera_that_saw_another_board_is_doubted() -> None:
     camera = row_of_cameras(3, 0.25, "SIMPLE_PINHOLE")[1]
     seen = [replace(one, sightings=one.sightings[:6]) for one in carried()]
@@ -535,6 +541,7 @@ def test_a_camera_that_saw_another_board_is_doubted() -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_same_sightings_twice_count_once() -> None:
     seen = carried()
     twice = [replace(one, sightings=one.sightings * 2) for one in seen]
@@ -672,12 +679,14 @@ def test_a_clock_that_is_late_contradicts_the_others_and_the_way_out_is_said() -
     )
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_a_little_late_is_doubted_and_the_way_out_is_said() -> None:
     _, certificate = calibrated([CARRIED], late_by(0.6))
 
     assert_doubted("'cam2' does not agree with the others|sync = \"estimate\"", certificate)
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_late_is_found_out_where_it_is_asked_for() -> None:
     settings = CalibrationSettings(sync="estimate")
 
@@ -703,6 +712,7 @@ def assert_same_to_the_bit(one: Rig, other: Rig) -> None:
         np.testing.assert_array_equal(camera.cam_from_world, other[camera.name].cam_from_world)
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_sightings_and_boards_changes_no_bit() -> None:
     boards = [CARRIED, Chessboard(8, 5, 0.07, name="another")]
     poses = carried_poses()

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import export_rig, import_rig, read_any_rig
+from hybridve.calib.formats.rig_export import export_rig
+from hybridve.calib.formats.rigs import import_rig, read_any_rig
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes
 from hybridve.calib.rig import Mount, Rig, RigCovariance

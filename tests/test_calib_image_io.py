@@ -69,7 +69,7 @@ def test_a_video_gives_the_frames_asked_for(
     assert source.count() == 12
 
 
-def test_an_absolute_glob_is_taken(images: Path, tmp_path: Path) -> None:
+def test_an_absolute_glob_is_taken(images: Path) -> None:
     assert open_source(Path("/nowhere"), f"{images}/*.png").count() == 4
 
 

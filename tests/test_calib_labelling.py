@@ -77,7 +77,7 @@ def seen_around(
         assert observed.picture is not None
         image = np.ascontiguousarray(observed.picture[:, ::-1])
         seen.append(in_picture(replace(observed, sightings=(*stills, None)), board, image))
-    return tuple([*cameras, *map(lens_mirrored, cameras)]), tuple(seen)
+    return (*cameras, *map(lens_mirrored, cameras)), tuple(seen)
 
 
 def in_picture(seen: Observations, board: Chessboard, image: np.ndarray) -> Observations:
@@ -124,6 +124,7 @@ def test_the_pose_behind_a_mirrored_picture_is_the_cameras_in_some_look(name: st
     assert np.linalg.det(pose[:, :3]) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["7x6", "6x6"])
 def test_a_mirrored_picture_is_named(name: str) -> None:
     told = refusal(name, (False, True, False))
@@ -151,6 +152,7 @@ def test_pictures_that_are_all_mirrored_show_a_world_that_there_might_be() -> No
     assert not evidence.is_weak
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["7x6", "8x6"])
 def test_where_nothing_is_around_the_board_nobody_is_accused(name: str) -> None:
     _, evidence = label(name, (False, True), is_textured=False)
@@ -159,6 +161,7 @@ def test_where_nothing_is_around_the_board_nobody_is_accused(name: str) -> None:
     assert evidence.is_weak is {"7x6": None, "8x6": True}[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigmas", [(1.0, 9.0), (9.0, 1.0)])
 def test_of_two_boards_the_one_that_is_told_worse_is_doubted(
     monkeypatch: pytest.MonkeyPatch, sigmas: tuple[float, float]
@@ -177,12 +180,14 @@ def test_of_two_boards_the_one_that_is_told_worse_is_doubted(
     assert evidence.weakest_sigma == 1.0
 
 
+@pytest.mark.slow
 def test_of_two_cameras_either_may_be_mirrored() -> None:
     told = refusal("8x6", (False, True))
 
     assert told.startswith("the picture of camera 'cam1' or of 'cam2' seems to be mirrored: ")
 
 
+@pytest.mark.slow
 def test_of_two_kinds_of_pictures_the_fewer_are_the_suspects() -> None:
     told = refusal("7x6", (True, False, True, True, False))
 
@@ -190,6 +195,7 @@ def test_of_two_kinds_of_pictures_the_fewer_are_the_suspects() -> None:
     assert told.endswith("record them unmirrored")
 
 
+@pytest.mark.slow
 def test_no_rig_is_made_of_a_mirrored_picture() -> None:
     _, seen = seen_around("8x6", True, 3)
 

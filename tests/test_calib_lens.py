@@ -173,6 +173,7 @@ def test_an_undistortion_is_kept_to_the_bit(
         undistortion(camera)
 
 
+@pytest.mark.slow
 def test_another_lens_is_another_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYBRIDVE_CACHE", str(tmp_path))
     camera = make_camera("cam", "OPENCV", POSE)

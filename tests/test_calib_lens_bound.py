@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import PINHOLE_MODELS, Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import import_rig, read_rig, write_rig
+from hybridve.calib.formats.rig_json import read_rig, write_rig
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.lens import (
     Undistortion,
     cam_from_img,
@@ -235,6 +236,7 @@ def test_a_box_of_rays_bounds_every_ray_in_it(camera: Camera, seed: int) -> None
             assert (narrow.high <= wide.high + 1e-12).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(camera=cameras(), seed=st.integers(0, 2**32 - 1))
 def test_no_point_is_answered_from_farther_than_promised(camera: Camera, seed: int) -> None:
@@ -280,6 +282,7 @@ def bound_and_largest(camera: Camera, seed: int) -> tuple[float, float]:
     return lens_shift_px(camera, lens), largest_px
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(camera=cameras(), grain_px=st.sampled_from([1, 2, 5, 30]), seed=st.integers(0, 2**32 - 1))
 @example(camera=make_camera("cam", "OPENCV", POSE), grain_px=3, seed=0)
@@ -336,6 +339,7 @@ def test_a_lone_pixel_can_vanish_where_the_lens_stretches() -> None:
     assert not alike_within(lone, place, shift_px)[0]
 
 
+@pytest.mark.slow
 @given(camera=cameras(), seed=st.integers(0, 2**32 - 1))
 def test_a_point_has_the_exact_answer_of_one_half_a_pixel_beside_it(
     camera: Camera, seed: int
@@ -399,6 +403,7 @@ def test_an_unknown_lens_is_refused_by_name() -> None:
         distorted("GOPRO", np.ones(4), one, one)
 
 
+@pytest.mark.slow
 def test_the_report_says_it_of_every_camera(run: Callable[..., int], tmp_path: Path) -> None:
     session = write_ball_session(tmp_path / "ball", np.zeros((1, 3)))
     scene = write_cube_scene(tmp_path / "scene", {"cube": (0.0, 0.0, 0.0)})

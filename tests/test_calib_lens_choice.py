@@ -102,6 +102,7 @@ def test_the_choice_can_be_stored_and_says_what_is_told_apart() -> None:
     assert "k1, k2, p1, p2 are told apart from zero" in chosen.choice.reason
 
 
+@pytest.mark.slow
 def test_what_hangs_together_in_a_view_counts_less() -> None:
     camera = make_camera("cam", "PINHOLE", np.eye(3, 4))
     rng = np.random.default_rng(1)
@@ -122,6 +123,7 @@ def test_what_hangs_together_in_a_view_counts_less() -> None:
     assert bent_choice.n_effective < 20 * 42
 
 
+@pytest.mark.slow
 def test_the_choice_does_not_depend_on_the_order_of_sightings() -> None:
     seen = noisy(make_camera("cam", "RADIAL", np.eye(3, 4)), 12, 0.2)
 
@@ -132,6 +134,7 @@ def test_the_choice_does_not_depend_on_the_order_of_sightings() -> None:
     np.testing.assert_array_equal(first.camera.params, turned.camera.params)
 
 
+@pytest.mark.slow
 def test_cameras_that_share_a_lens_choose_together() -> None:
     camera = make_camera("a", "OPENCV", np.eye(3, 4))
     seen = [noisy(camera, 12, 0.1, 1), noisy(replace(camera, name="b"), 12, 0.1, 2)]
@@ -143,6 +146,7 @@ def test_cameras_that_share_a_lens_choose_together() -> None:
     np.testing.assert_array_equal(first.camera.params, second.camera.params)
 
 
+@pytest.mark.slow
 def test_parallel_boards_choose_nothing() -> None:
     camera = make_camera("cam", "OPENCV", np.eye(3, 4))
     rng = np.random.default_rng(4)

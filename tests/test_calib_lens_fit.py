@@ -174,6 +174,7 @@ def noisy(
     ]
 
 
+@pytest.mark.slow
 def test_noise_and_parameters_are_as_far_off_as_is_told() -> None:
     camera = make_camera("cam", "OPENCV", np.eye(3, 4))
     off = []

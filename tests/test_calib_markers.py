@@ -56,6 +56,7 @@ def rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("legacy", [False, True])
 def test_charuco_corners_are_found_and_the_pattern_is_named(camera: Camera, legacy: bool) -> None:
     pose = facing(CHARUCO, 0.9)
@@ -87,6 +88,7 @@ def test_a_board_seen_in_part_has_nan_where_it_is_not_seen(camera: Camera) -> No
     assert rms(errors_px(camera, pose, CHARUCO, corners)) < RENDERED_RMS_PX
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [CHARUCO, APRIL])
 def test_inverted_and_mirrored_boards_are_found_and_said(
     camera: Camera, board: Charuco | AprilGrid
@@ -139,6 +141,7 @@ def test_two_boards_in_one_image_are_told_apart_by_their_first_marker(camera: Ca
         assert rms(errors_px(camera, pose, board, corners)) < TOLD_APART_PX
 
 
+@pytest.mark.slow
 def test_corners_of_squares_that_are_not_square_are_where_they_were_measured(
     camera: Camera,
 ) -> None:
@@ -154,6 +157,7 @@ def test_corners_of_squares_that_are_not_square_are_where_they_were_measured(
     np.testing.assert_allclose(board.points_board[-1], [0.6, 0.372, 0.0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_in_a_large_image_points_are_as_exact() -> None:
     camera = Camera("cam", "PINHOLE", 2401, 1603, np.array([1900.0, 1900, 1210, 790]), np.eye(3, 4))
     board = Charuco(5, 4, 0.05, 0.0375, "DICT_4X4_100", first_id=30)

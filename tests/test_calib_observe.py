@@ -176,6 +176,7 @@ def pixels_of(sightings: tuple[Sighting, ...]) -> dict[tuple[str, int], NDArray[
 # --- What is found ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_stills_and_a_still_clip_are_told_apart(recorded: Path) -> None:
     observations = observe_boards([BOARD], inputs(recorded), SETTINGS)
 
@@ -210,6 +211,7 @@ def test_somebody_who_crosses_the_clip_leaves_no_trace(recorded: Path) -> None:
     assert np.abs(seen.picture - without).mean() < 2.0  # noise; the person would leave 10
 
 
+@pytest.mark.slow
 def test_a_board_that_most_frames_hide_is_found_in_the_others(
     recorded: Path, tmp_path: Path
 ) -> None:
@@ -337,6 +339,7 @@ def two_boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_each_picture_may_show_any_of_the_boards(two_boards: Path) -> None:
     left, right = observe_boards([BOARD, SMALL], inputs(two_boards), SETTINGS)
 
@@ -669,6 +672,7 @@ def test_given_corners_name_their_board(two_boards: Path, tmp_path: Path) -> Non
     assert ("0.png", 0) not in pixels_of(seen.sightings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("header", ["x,y", "corner,x,y"])
 def test_corners_of_the_clip_serve_where_none_are_found(
     recorded: Path, hidden: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, header: str
@@ -746,6 +750,7 @@ def test_corners_of_several_boards_must_say_of_which(two_boards: Path, tmp_path:
 # --- Bad input --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_no_board_is_named_with_what_was_tried(
     recorded: Path, hidden: Path
 ) -> None:

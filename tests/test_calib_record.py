@@ -10,13 +10,14 @@ from typing import Any
 
 import pytest
 from helpers.boards import look_at, make_camera
-from helpers.records import make_camera_record, make_check, make_record
+from helpers.records import make_camera_record, make_check, make_opinion, make_record
 
 from hybridve.calib import record as record_module
 from hybridve.calib import verdict as verdict_module
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import read_rig, rig_to_dict, write_rig
+from hybridve.calib.formats.rig_json import read_rig, rig_to_dict, write_rig
 from hybridve.calib.plain import Told, to_plain
+from hybridve.calib.provenance import MadeElsewhere, provenance_from_plain
 from hybridve.calib.record import (
     BY_SCENE,
     Adjustment,
@@ -25,12 +26,11 @@ from hybridve.calib.record import (
     ClocksRecord,
     Labelling,
     LensChoice,
-    MadeElsewhere,
     MountRecord,
     Noise,
+    NoOpinion,
     Outlier,
     WorldRecord,
-    provenance_from_plain,
 )
 from hybridve.calib.rig import Rig
 from hybridve.calib.verdict import Moved, RigTest, Turned
@@ -41,6 +41,7 @@ Captured = pytest.CaptureFixture[str]
 #: Fields that a file may lack, as they say nothing that a gate asks for, or an older program left
 #: them out. Every other field of every dataclass of a record must be there.
 MAY_BE_MISSING = {
+    "Adjustment.start",
     "CalibrationRecord.clocks",
     "CalibrationRecord.noise_by_group",
     "CameraRecord.model_chosen",
@@ -131,7 +132,9 @@ def whole() -> CalibrationRecord:
             worst_outliers=(Outlier("still", "3.png", 0, 17, 2.5),),
             left_out={"4.png": "it contradicts the others"},
             warnings=(CONTRADICTION,),
+            start="COLMAP's adjustment",
         ),
+        second_opinion=make_opinion(9.0),
     )
 
 
@@ -175,10 +178,8 @@ def places_of(value: object, at: Place = ()) -> Iterator[tuple[str, Place]]:
 
 
 #: Each field at the first place where it stands.
-PLACES = {name: place for name, place in reversed(list(places_of(whole())))}
-CHECK_PLACES = {
-    name: place for name, place in reversed(list(places_of(whole_test().check, ("check",))))
-}
+PLACES = dict(reversed(list(places_of(whole()))))
+CHECK_PLACES = dict(reversed(list(places_of(whole_test().check, ("check",)))))
 
 
 def changed(plain: dict[str, Any], place: Place, how: str) -> dict[str, Any]:
@@ -227,7 +228,7 @@ def test_every_field_of_a_record_and_of_a_check_is_tried() -> None:
     }
     known = {f"{kind.__name__}.{one.name}" for kind in kinds for one in fields(kind)}
 
-    assert known == PLACES.keys() | CHECK_PLACES.keys()
+    assert known == PLACES.keys() | CHECK_PLACES.keys() | {"NoOpinion.reason"}
 
 
 def test_a_record_and_a_check_are_read_back_as_they_were(tmp_path: Path, rig: Rig) -> None:
@@ -238,6 +239,29 @@ def test_a_record_and_a_check_are_read_back_as_they_were(tmp_path: Path, rig: Ri
     assert again.provenance == rig.provenance
     assert again.check == rig.check
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "rig.json").read_bytes()
+
+
+def test_a_record_without_a_second_opinion_says_why_or_is_older() -> None:
+    plain = to_plain(replace(whole(), second_opinion=NoOpinion("COLMAP rests")))
+    told = provenance_from_plain(plain)
+    assert isinstance(told, CalibrationRecord)
+    assert told.second_opinion == NoOpinion("COLMAP rests")
+    assert told.doubts == whole().doubts[:-1]
+    for spoilt in (
+        changed(plain, ("second_opinion", "reason"), "missing"),
+        changed(plain, ("second_opinion", "reason"), "of another type"),
+        changed(plain, ("second_opinion",), "missing"),
+    ):
+        with pytest.raises(CalibrationError, match=r"provenance.*second_opinion"):
+            provenance_from_plain(spoilt)
+
+    older = changed(
+        changed(plain, ("second_opinion",), "missing"), ("adjustment", "start"), "missing"
+    )
+
+    told = provenance_from_plain(older)
+    assert isinstance(told, CalibrationRecord)
+    assert told.second_opinion is None
 
 
 @pytest.mark.parametrize("how", ["missing", "renamed", "of another type"])
@@ -352,8 +376,27 @@ def test_each_doubt_is_told_once_and_alone() -> None:
     assert contradicted.doubts == (CONTRADICTION,)
     (doubt,) = weak.doubts
     assert "which way round" in doubt
-    assert whole().doubts == (CONTRADICTION, doubt)
+    (other,) = replace(sure, second_opinion=make_opinion(9.0)).doubts
+    assert other.startswith("COLMAP's own adjustment")
+    assert "9.00 mm" in other
+    assert "9.0 standard" in other
+    assert whole().doubts == (CONTRADICTION, doubt, other)
     assert whole().warnings == ("look at p",)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sigmas": 3.9},  # it may be chance
+        {"difference95_m": 2.9e-3},  # it is within what is stated
+        {"difference95_px": 0.009},  # it is rounding
+    ],
+)
+def test_a_difference_is_a_doubt_only_where_all_speaks_for_it(change: dict[str, float]) -> None:
+    clear = make_opinion(9.0)
+
+    assert clear.disagrees
+    assert not replace(clear, **change).disagrees
 
 
 def test_cameras_that_are_called_anew_keep_what_is_told_of_them() -> None:

@@ -16,10 +16,12 @@ from hybridve.calib.boards.markers import Charuco
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.calibrate import calibrate_rig, solve_rig
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import import_rig, rig_to_dict
+from hybridve.calib.formats.rig_json import rig_to_dict
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.image_io import open_source
 from hybridve.calib.judging.check import check_rig
 from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.record import CalibrationRecord, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 from hybridve.calib.seeing.observe import find_boards, observe_boards
@@ -93,6 +95,15 @@ def test_horseman_corners_miss_by_less_than_half_a_pixel(horseman: Rig) -> None:
     assert json.dumps(rig_to_dict(horseman), allow_nan=False)
 
 
+def test_colmap_agrees_about_horseman(horseman: Rig) -> None:
+    record = horseman.provenance
+
+    assert isinstance(record, CalibrationRecord)
+    assert isinstance(record.second_opinion, SecondOpinion)
+    assert record.second_opinion.difference95_m < record.second_opinion.expected95_m
+    assert record.doubts == ()
+
+
 def test_horseman_cameras_are_above_the_floor_and_upright(horseman: Rig) -> None:
     heights_m = horseman.centers_world[:, 2]
     assert ((heights_m > 1.2) & (heights_m < 1.6)).all()
@@ -107,6 +118,7 @@ def test_the_scene_tells_which_way_round_horsemans_board_was_seen(horseman: Rig)
     assert evidence.weakest_sigma > 5.0
 
 
+@pytest.mark.slow
 def test_marks_set_the_world_that_their_reference_has(
     horseman_inputs: Callable[[bool], list[CameraInput]], recordings: Path, horseman: Rig
 ) -> None:
@@ -228,6 +240,7 @@ def test_without_the_scene_nobody_tells_how_horsemans_cameras_are_turned(
     assert check.undecided == CAMERAS
 
 
+@pytest.mark.slow
 def test_a_camera_of_the_wrong_board_is_named(
     horseman_inputs: Callable[[bool], list[CameraInput]],
 ) -> None:
@@ -274,6 +287,7 @@ def test_dino_ring_rows_are_taken_by_image(recordings: Path) -> None:
         assert np.abs(off[:2]).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_stereo_pair_of_moving_boards_has_its_published_baseline(recordings: Path) -> None:
     root = recordings / "opencv_stereo"
     cameras = [
@@ -304,6 +318,7 @@ def test_a_stereo_pair_in_two_files_is_taken(recordings: Path) -> None:
     assert [camera.model for camera in rig.cameras] == ["FULL_OPENCV", "FULL_OPENCV"]
 
 
+@pytest.mark.slow
 def test_a_charuco_rig_misses_by_less_than_its_publisher_accepts(recordings: Path) -> None:
     root = recordings / "pycamset"
     board = Charuco(20, 20, 0.004, 0.0032, "DICT_4X4_1000", legacy=False)
@@ -317,6 +332,8 @@ def test_a_charuco_rig_misses_by_less_than_its_publisher_accepts(recordings: Pat
     misses_px = np.linalg.norm(np.concatenate(list(calibration.residuals_px.values())), axis=1)
     assert misses_px.mean() <= 1.30  # the publisher accepts 1.8, a plain adjustment reached 1.26
     assert len(misses_px) > 5000  # not by leaving out what does not fit
+    assert isinstance(calibration.record.second_opinion, SecondOpinion)
+    assert not calibration.record.second_opinion.disagrees
     first, second, third = calibration.rig.cameras
     for camera in calibration.rig.cameras:
         np.testing.assert_allclose(camera.params[:2], 2855.0, rtol=0.015)

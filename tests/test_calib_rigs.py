@@ -14,10 +14,11 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.colmap import read_colmap_model, write_colmap_model
-from hybridve.calib.formats.rigs import import_rig, read_rig, rig_to_dict, write_rig
+from hybridve.calib.formats.rig_json import read_rig, rig_to_dict, write_rig
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import angle_between, compose, transform
-from hybridve.calib.record import MadeElsewhere
+from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 #: Text with 17 digits gives a projection back to this, in pixels.

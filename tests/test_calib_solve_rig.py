@@ -62,6 +62,7 @@ def test_noise_free_corners_give_back_the_rig(model: str) -> None:
     assert rig.provenance.rms_px < EXACT_PX
 
 
+@pytest.mark.slow
 def test_models_may_be_mixed_in_one_rig() -> None:
     cameras = ring(BOARD, ["OPENCV", "OPENCV_FISHEYE", "PINHOLE", "DIVISION"])
 
@@ -71,6 +72,7 @@ def test_models_may_be_mixed_in_one_rig() -> None:
     assert_same_rig(rig, cameras)
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_does_not_matter() -> None:
     cameras = ring(BOARD, ["OPENCV", "RADIAL", "OPENCV"])
     observations = observe_exactly(BOARD, cameras, noise_px=0.3)
@@ -84,6 +86,7 @@ def test_the_order_of_cameras_does_not_matter() -> None:
         np.testing.assert_array_equal(turned[camera.name].cam_from_world, camera.cam_from_world)
 
 
+@pytest.mark.slow
 def test_the_same_corners_give_the_same_rig_to_the_bit() -> None:
     observations = observe_exactly(BOARD, ring(BOARD, ["OPENCV", "OPENCV"]), noise_px=0.3)
 
@@ -95,6 +98,7 @@ def test_the_same_corners_give_the_same_rig_to_the_bit() -> None:
     assert first.provenance == second.provenance
 
 
+@pytest.mark.slow
 def test_the_error_that_is_told_is_the_noise_that_was_there() -> None:
     noise_px = 0.2
     cameras = ring(BOARD, ["OPENCV", "OPENCV"])
@@ -267,6 +271,7 @@ def side_by_side(model: str) -> list[Camera]:
     ]
 
 
+@pytest.mark.slow
 def test_a_moving_board_ties_cameras_together() -> None:
     cameras = side_by_side("OPENCV")
     observations, world_from_board = moving(BOARD, cameras)
@@ -281,6 +286,7 @@ def test_a_moving_board_ties_cameras_together() -> None:
     assert_same_rig(rig, expected)
 
 
+@pytest.mark.slow
 def test_frames_tell_which_way_round_a_symmetric_board_was_seen() -> None:
     board = Chessboard(8, 6, 0.1)
     cameras = side_by_side("PINHOLE")

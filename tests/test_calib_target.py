@@ -99,6 +99,7 @@ def test_a_turned_listing_belongs_to_a_turned_board(board: Chessboard) -> None:
         )
 
 
+@pytest.mark.slow
 def test_corners_are_found_where_they_are_with_pixel_centres_at_a_half(
     near: tuple[Camera, NDArray[np.uint8]],
 ) -> None:
@@ -113,6 +114,7 @@ def test_corners_are_found_where_they_are_with_pixel_centres_at_a_half(
     assert np.abs(errors.mean(axis=0)).max() < RENDERED_BIAS_PX
 
 
+@pytest.mark.slow
 def test_a_small_board_at_a_low_angle_is_found() -> None:
     camera = camera_at((3.3, -2.6, 1.4), (644, 486))
     expected = project(camera, camera.cam_from_world, BOARD)
@@ -143,6 +145,7 @@ def test_a_camera_over_the_printed_side_sees_the_board_from_above(
     assert center_board[2] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("starts_black", [True, False])
 def test_colours_tell_the_ends_of_an_odd_board_apart(starts_black: bool) -> None:
     board = Chessboard(7, 6, 0.1)
@@ -243,6 +246,7 @@ def test_a_picture_without_a_board_gives_none_and_says_what_was_tried(
     assert detection.how.startswith("tried classic")
 
 
+@pytest.mark.slow
 def test_another_board_is_not_taken_for_this_one(near: tuple[Camera, NDArray[np.uint8]]) -> None:
     _, image = near
 

@@ -8,8 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from helpers.bundles import make_bundle, perturbed
-from helpers.colmap_adjust import colmap_adjust
 from helpers.theory import (
     BOARD,
     least_covariance,
@@ -22,9 +20,7 @@ from helpers.theory import (
 from numpy.typing import NDArray
 
 from hybridve.calib.calibrate import solve_rig
-from hybridve.calib.pose import angle_between
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.bundle import Bundle, adjust, view_residuals
 from hybridve.calib.solving.covariance import point_errors
 
 NOISE_PX = 0.3
@@ -58,6 +54,7 @@ def mean_of_squares(matrices: list[NDArray[np.float64]]) -> tuple[float, float]:
     return sum(squares for squares, _ in found) / count, 4.0 * np.sqrt(2.0 / count)
 
 
+@pytest.mark.slow
 def test_errors_are_as_small_as_theory_allows() -> None:
     """An estimate a quarter worse than the Cramer-Rao bound would have the mean 1.56, not 1."""
     bound = least_covariance(SCENE, NOISE_PX)
@@ -68,6 +65,7 @@ def test_errors_are_as_small_as_theory_allows() -> None:
     assert mean == pytest.approx(1.0, abs=four_deviations)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_each_rig_says() -> None:
     """Deviations stated a fifth too small or too large would have the mean 1.56 or 0.69."""
     mean, four_deviations = mean_of_squares([matrix_of(rig) for rig in calibrations()])
@@ -96,20 +94,3 @@ def test_points_are_within_the_radius_stated_for_them() -> None:
     )
     # The points of one rig err together: 4 deviations of as many trials as rigs.
     assert inside.mean() > 0.95 - 4.0 * np.sqrt(0.95 * 0.05 / N_SEEDS)
-
-
-def test_colmap_finds_the_same_minimum() -> None:
-    start = perturbed(make_bundle(["OPENCV", "RADIAL"], 8, NOISE_PX, seed=3), seed=4, by=0.002)
-
-    ours, theirs = adjust(start).bundle, colmap_adjust(start)
-
-    assert squares(ours) == pytest.approx(squares(theirs), rel=1e-9)
-    assert squares(ours) < 0.9 * squares(start)
-    for one, other in zip(ours.cameras, theirs.cameras, strict=True):
-        assert angle_between(one.cam_from_world, other.cam_from_world) < 1e-6
-        assert np.abs(one.center_world - other.center_world).max() < 1e-6
-        np.testing.assert_allclose(one.params, other.params, atol=1e-3)
-
-
-def squares(bundle: Bundle) -> float:
-    return float(sum((missed**2).sum() for missed in view_residuals(bundle)))

@@ -82,6 +82,7 @@ def test_a_second_board_tells_whether_it_is_symmetric_or_not(second: Chessboard)
     assert (state(right), state(wrong)) == ("agrees", "refuted")
 
 
+@pytest.mark.slow
 def test_the_distance_that_is_told_is_that_of_the_two_places() -> None:
     cameras, seen = around(QUARTERS, 1, 3, True)
 
@@ -106,6 +107,7 @@ def test_of_two_cameras_either_is_named() -> None:
     assert "either 'cam1' or 'cam2' stand elsewhere" in check.message
 
 
+@pytest.mark.slow
 def test_corners_that_were_given_by_hand_in_one_order_tell() -> None:
     cameras, seen = around(SYMMETRIC, 0, 4, False)
     by_hand = []
@@ -124,6 +126,7 @@ def test_corners_that_were_given_by_hand_in_one_order_tell() -> None:
     assert states[0, 0, 1, 0] == ("refuted", ("cam3",))
 
 
+@pytest.mark.slow
 def test_a_camera_that_alone_sees_no_scene_is_open_and_the_others_are_told() -> None:
     cameras, seen = around(SYMMETRIC, 2, 4, True)
     blind = [replace(one, picture=None) if one.name == "cam4" else one for one in seen]

@@ -15,9 +15,10 @@ from helpers.records import make_record
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import read_rig, write_rig
+from hybridve.calib.formats.rig_json import read_rig, write_rig
 from hybridve.calib.pose import compose, rotation_about_axes
-from hybridve.calib.record import BY_SCENE, Labelling, MadeElsewhere
+from hybridve.calib.provenance import MadeElsewhere
+from hybridve.calib.record import BY_SCENE, Labelling
 from hybridve.calib.rig import Rig
 from hybridve.cli.calibrate import NOT_GOOD_ENOUGH
 from hybridve.hull.capture import rig_check
@@ -325,6 +326,7 @@ def lie_symmetric_board(session: Path, is_textured: bool) -> None:
     session.write_text(text.replace("columns = 7", "columns = 8"), encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_camera_turned_about_a_board_that_looks_the_same_then_is_refused(session: Path) -> None:
     lie_symmetric_board(session, is_textured=True)
     assert told(load(session))[0] == "agrees"
@@ -335,6 +337,7 @@ def test_a_camera_turned_about_a_board_that_looks_the_same_then_is_refused(sessi
         load(session)
 
 
+@pytest.mark.slow
 def test_where_nothing_tells_how_cameras_are_turned_that_is_said_each_time(
     session: Path,
     run: Callable[..., int],

@@ -209,6 +209,7 @@ def test_what_has_the_colour_of_a_shadow_but_not_the_texture_is_an_object(
     assert not (mask & ~cv2.dilate(truth, np.ones((3, 3), np.uint8)) & 1).any()
 
 
+@pytest.mark.slow
 def test_without_shadows_allowed_they_are_objects() -> None:
     rng = np.random.default_rng(3)
     scene = a_scene(rng)

@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.pose import angle_between, compose, invert
+from hybridve.calib.record import CalibrationRecord, SecondOpinion
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 from hybridve.hull.report.read import read_report
 from hybridve.hull.synth import read_truth, true_masks
@@ -41,6 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_rig_is_found_to_a_few_millimetres(folder: Path) -> None:
     truth = read_truth(folder / "session")
     rig = read_rig(folder / "session" / "rig" / "rig.json")
@@ -52,6 +54,16 @@ def test_the_rig_is_found_to_a_few_millimetres(folder: Path) -> None:
         assert angle_between(found.cam_from_world, camera.cam_from_world) < 0.003
 
 
+def test_colmap_agrees_about_the_rig(folder: Path) -> None:
+    record = read_rig(folder / "session" / "rig" / "rig.json").provenance
+
+    assert isinstance(record, CalibrationRecord)
+    assert isinstance(record.second_opinion, SecondOpinion)
+    assert record.second_opinion.difference95_m < record.second_opinion.expected95_m
+    assert record.doubts == ()
+
+
+@pytest.mark.slow
 def test_the_rig_is_as_wrong_as_its_covariance_says(folder: Path) -> None:
     """From pictures, whose corners err as they like: the squared error a parameter, about one."""
     rig = read_rig(folder / "session" / "rig" / "rig.json")
@@ -70,6 +82,7 @@ def test_the_rig_is_as_wrong_as_its_covariance_says(folder: Path) -> None:
     assert 0.4 < pulls @ np.linalg.solve(scaled, pulls) / len(pulls) < 2.5
 
 
+@pytest.mark.slow
 def test_silhouettes_cover_what_is_there(folder: Path) -> None:
     with SilhouetteReader(folder / "session" / "silhouettes.h5") as reader:
         for frame in range(0, N_FRAMES, 5):
@@ -81,6 +94,7 @@ def test_silhouettes_cover_what_is_there(folder: Path) -> None:
                 assert (true & found).sum() / (true | found).sum() > 0.85, (frame, name)
 
 
+@pytest.mark.slow
 def test_every_true_collision_is_found_and_what_is_far_is_free(folder: Path) -> None:
     truth = read_truth(folder / "session")
     report = read_report(folder / "report.h5")
@@ -97,6 +111,7 @@ def test_every_true_collision_is_found_and_what_is_far_is_free(folder: Path) -> 
     assert (report.objects["shelf"].certificate == "free").all()
 
 
+@pytest.mark.slow
 def test_the_pictures_show_the_collision_in_red(run: Run, folder: Path) -> None:
     session, report = folder / "session", folder / "report.h5"
     arguments = [session, "--scene", session / "scene.toml", "--report", report]

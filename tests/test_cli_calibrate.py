@@ -13,12 +13,13 @@ import pytest
 from click.testing import CliRunner
 from helpers.boards import board_poses, look_at, make_camera, render_board
 from helpers.recorded_boards import held_up
+from helpers.records import make_opinion
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Detection, Effort
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.judging.account import Calibration
 from hybridve.calib.pose import compose
 from hybridve.calib.record import BY_SCENE, Labelling
@@ -132,6 +133,7 @@ def calibrated(recorded: Path) -> tuple[Path, dict[str, Any], str]:
     return out, json.loads(ran.stdout), ran.stderr
 
 
+@pytest.mark.slow
 def test_the_rig_is_where_the_cameras_stood(calibrated: tuple[Path, dict[str, Any], str]) -> None:
     rig = read_rig(calibrated[0] / "rig.json")
 
@@ -142,6 +144,7 @@ def test_the_rig_is_where_the_cameras_stood(calibrated: tuple[Path, dict[str, An
     assert rig.covariance is not None
 
 
+@pytest.mark.slow
 def test_the_certificate_is_the_same_in_all_forms(
     calibrated: tuple[Path, dict[str, Any], str],
 ) -> None:
@@ -159,6 +162,7 @@ def test_the_certificate_is_the_same_in_all_forms(
     assert [one["name"] for one in told["cameras"]] == ["cam1", "cam2", "cam3"]
 
 
+@pytest.mark.slow
 def test_nothing_half_written_stands_beside_the_rig(
     calibrated: tuple[Path, dict[str, Any], str],
 ) -> None:
@@ -167,6 +171,7 @@ def test_nothing_half_written_stands_beside_the_rig(
     assert names == {"rig.json", "certificate.json", "certificate.html", "colmap", "corners"}
 
 
+@pytest.mark.slow
 def test_a_second_run_reads_no_picture_and_says_the_same(
     run: Run,
     capsys: Captured,
@@ -188,6 +193,7 @@ def test_a_second_run_reads_no_picture_and_says_the_same(
     assert not (out / "certificate.html").exists()
 
 
+@pytest.mark.slow
 def test_what_is_unusual_about_boards_is_told_once(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +212,7 @@ def test_what_is_unusual_about_boards_is_told_once(
     assert all(line.strip().endswith(" views: inverted") for line in lines)
 
 
+@pytest.mark.slow
 def test_a_rig_that_exists_is_kept_unless_told(
     run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
 ) -> None:
@@ -222,6 +229,7 @@ def test_a_rig_that_exists_is_kept_unless_told(
     )
 
 
+@pytest.mark.slow
 def test_the_text_begins_with_the_verdict(
     run: Run,
     capsys: Captured,
@@ -233,9 +241,14 @@ def test_the_text_begins_with_the_verdict(
 
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == calibrated[1]["certificate"]["verdict"]
+    told = calibrated[1]["certificate"]["second_opinion"]
+    assert told["difference95_m"] < told["expected95_m"]
+    (opinion,) = [line for line in lines if "second opinion" in line]
+    assert f"{told['sigmas']:.1f} standard deviations" in opinion
     assert lines[1] == f"{tmp_path / 'rig' / 'rig.json'}: 3 cameras"
 
 
+@pytest.mark.slow
 def test_a_rig_that_is_not_good_enough_has_a_status_of_its_own(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -267,18 +280,24 @@ def labelled_by_chance(made: Calibration) -> Calibration:
     return replace(made, record=replace(made.record, labelling=weak))
 
 
+def contradicted_by_colmap(made: Calibration) -> Calibration:
+    return replace(made, record=replace(made.record, second_opinion=make_opinion(9.0)))
+
+
 def with_a_twin(made: Calibration) -> Calibration:
     first, second, third = made.rig.cameras
     twin = replace(first, name=second.name)
     return replace(made, rig=replace(made.rig, cameras=(first, twin, third)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("doubtful", "told"),
     [
         (contradicted, "cameras do not agree."),
         (labelled_by_chance, "which way round each camera saw it"),
         (with_a_twin, "stand in one place"),
+        (contradicted_by_colmap, "COLMAP's own adjustment of the same points"),
     ],
 )
 def test_a_rig_that_is_doubted_passes_no_gate(
@@ -307,8 +326,13 @@ def test_a_rig_that_is_doubted_passes_no_gate(
     assert calibrated[1]["certificate"]["doubts"] == []
 
 
+@pytest.mark.slow
 def test_the_volume_is_the_one_that_is_asked_for(
-    run: Run, capsys: Captured, recorded: Path, tmp_path: Path
+    run: Run,
+    capsys: Captured,
+    calibrated: tuple[Path, dict[str, Any], str],
+    recorded: Path,
+    tmp_path: Path,
 ) -> None:
     box = "0,0,0:600,500,200"
     arguments = ["calibrate", standing(recorded), "-o", tmp_path / "rig", "--no-page", "--json"]
@@ -316,12 +340,15 @@ def test_the_volume_is_the_one_that_is_asked_for(
     assert run(*arguments, "--volume-mm", box) == 0
 
     certificate = json.loads(capsys.readouterr().out)["certificate"]
+    usual = calibrated[1]["certificate"]["second_opinion"]
+    assert certificate["second_opinion"]["expected95_m"] < usual["expected95_m"]
     low, high = certificate["volume_low_m"], certificate["volume_high_m"]
     assert (np.array(low) >= -1e-9).all()
     assert (np.array(high) <= [0.6 + 1e-9, 0.5 + 1e-9, 0.2 + 1e-9]).all()
     assert high[2] == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -341,6 +368,7 @@ def test_wrong_usage_is_status_2(
 # --- A rig that is checked ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_rig_that_still_fits_passes_its_check(
     run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
 ) -> None:
@@ -353,6 +381,7 @@ def test_a_rig_that_still_fits_passes_its_check(
     assert told["scale"] == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_bumped_is_named_with_status_4(
     run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
 ) -> None:
@@ -388,6 +417,7 @@ def expect_no_rig(run: Run, capsys: Captured, message: str, path: Path, output: 
     assert not list(output.glob("certificate*"))
 
 
+@pytest.mark.slow
 def test_one_camera_is_calibrated_and_passes_no_gate(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -405,6 +435,7 @@ def test_one_camera_is_calibrated_and_passes_no_gate(
     assert off_m < PLACED_M
 
 
+@pytest.mark.slow
 def test_a_camera_upside_down_is_placed_as_it_hangs(
     run: Run, recorded: Path, tmp_path: Path
 ) -> None:
@@ -427,6 +458,7 @@ def test_a_camera_upside_down_is_placed_as_it_hangs(
     )
 
 
+@pytest.mark.slow
 def test_exchanged_clips_are_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -437,6 +469,7 @@ def test_exchanged_clips_are_one_line(
     )
 
 
+@pytest.mark.slow
 def test_a_recording_listed_twice_is_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -447,6 +480,7 @@ def test_a_recording_listed_twice_is_one_line(
     expect_no_rig(run, capsys, "'cam1' and 'cam3' show the same pictures", twice, tmp_path / "rig")
 
 
+@pytest.mark.slow
 def test_mirrored_pictures_are_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:
@@ -459,6 +493,7 @@ def test_mirrored_pictures_are_one_line(
     expect_no_rig(run, capsys, "seems to be mirrored", mirrored, tmp_path / "rig")
 
 
+@pytest.mark.slow
 def test_pictures_without_the_board_are_one_line(
     run: Run, capsys: Captured, recorded: Path, tmp_path: Path
 ) -> None:

@@ -9,7 +9,9 @@ from click.testing import CliRunner, Result
 from helpers.boards import look_at, make_camera
 
 from hybridve.calib.errors import HybridveError
-from hybridve.calib.formats.rigs import FORMATS, read_any_rig, read_rig, write_rig
+from hybridve.calib.formats.rig_export import FORMATS
+from hybridve.calib.formats.rig_json import read_rig, write_rig
+from hybridve.calib.formats.rigs import read_any_rig
 from hybridve.calib.lens import project_points
 from hybridve.calib.rig import Rig
 from hybridve.cli.convert import FormatName

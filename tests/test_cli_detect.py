@@ -43,6 +43,7 @@ def distance_to_cube_surface_m(center: np.ndarray) -> float:
     return float(outside if outside > 0 else inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "engine",
     [
@@ -83,6 +84,7 @@ def test_every_frame_in_which_the_ball_meets_the_surface_collides(
     assert (far.certificate == "free").all()
 
 
+@pytest.mark.slow
 def test_the_engines_write_the_same_points(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -99,6 +101,7 @@ def test_the_engines_write_the_same_points(
     assert len(found["native"][0]) > 0
 
 
+@pytest.mark.slow
 def test_a_finer_accuracy_takes_smaller_steps_and_says_so(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -140,6 +143,7 @@ def test_a_damaged_picture_is_a_row_with_a_reason(run: Run, tmp_path: Path, scen
     assert report.objects["hit"].collides.tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 def test_a_late_camera_is_read_in_step_with_the_others(
     run: Run, tmp_path: Path, scene: Path
 ) -> None:
@@ -180,6 +184,7 @@ def test_a_camera_that_stops_early_is_told_with_what_to_do(
     assert len(read_report(path).index) == 9
 
 
+@pytest.mark.slow
 def test_status_3_tells_of_a_clash_only_if_asked(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -207,6 +212,7 @@ def test_a_frame_that_could_not_be_read_is_no_kept_distance(
     assert "cam2" in rows.why[1]
 
 
+@pytest.mark.slow
 def test_something_inside_or_too_near_is_a_clash_too(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -226,6 +232,7 @@ def test_something_inside_or_too_near_is_a_clash_too(
         assert run("detect", session, "--scene", near, "-o", path, *common) == status, required_mm
 
 
+@pytest.mark.slow
 def test_an_existing_report_is_refused_and_kept(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -352,6 +359,7 @@ def test_json_of_detect_is_that_of_summary(
     assert json.loads(capsys.readouterr().out) == told
 
 
+@pytest.mark.slow
 def test_summary_counts_what_the_report_holds(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -373,6 +381,7 @@ def test_summary_counts_what_the_report_holds(
     assert "1 clash, 1 kept" in text
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
     tmp_path: Path, scene: Path, run: Run
 ) -> None:
@@ -424,6 +433,7 @@ def test_an_interrupted_run_leaves_no_report_and_is_taken_up_to_the_same_bits(
     assert not (tmp_path / "report.h5.parts").exists()
 
 
+@pytest.mark.slow
 def test_what_the_samples_miss_is_certified_told_and_fails_on_clash(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

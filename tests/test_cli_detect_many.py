@@ -52,6 +52,7 @@ def arguments(
 REPORTS = ["ann__far.h5", "ann__near.h5", "bob__far.h5", "bob__near.h5"]
 
 
+@pytest.mark.slow
 def test_every_session_is_tested_against_every_layout(
     run: Run,
     tmp_path: Path,
@@ -84,6 +85,7 @@ def test_every_session_is_tested_against_every_layout(
     assert "clash, 1 of 2 frames" in line
 
 
+@pytest.mark.slow
 def test_a_report_of_several_is_that_of_one(
     run: Run, tmp_path: Path, sessions: list[Path], layouts: list[Path]
 ) -> None:
@@ -98,6 +100,7 @@ def test_a_report_of_several_is_that_of_one(
     assert one.settings == other.settings
 
 
+@pytest.mark.slow
 def test_one_that_fails_does_not_lose_the_others(
     run: Run,
     tmp_path: Path,
@@ -127,6 +130,7 @@ def test_one_that_fails_does_not_lose_the_others(
     assert (folder / "bob__near.h5").exists()
 
 
+@pytest.mark.slow
 def test_resuming_makes_what_is_missing_and_keeps_what_is_finished(
     run: Run, tmp_path: Path, sessions: list[Path], layouts: list[Path]
 ) -> None:
@@ -142,6 +146,7 @@ def test_resuming_makes_what_is_missing_and_keeps_what_is_finished(
     assert all((folder / name).read_bytes() == content for name, content in kept.items())
 
 
+@pytest.mark.slow
 def test_an_interrupted_call_goes_on_in_the_middle_of_a_report(
     run: Run,
     tmp_path: Path,
@@ -175,6 +180,7 @@ def test_an_interrupted_call_goes_on_in_the_middle_of_a_report(
         assert found["cube"][name].tobytes() == values.tobytes(), name
 
 
+@pytest.mark.slow
 def test_a_finished_report_of_other_settings_is_not_taken_for_this_one(
     run: Run,
     tmp_path: Path,
@@ -193,6 +199,7 @@ def test_a_finished_report_of_other_settings_is_not_taken_for_this_one(
     assert "2 of 2 reports could not be made" in error
 
 
+@pytest.mark.slow
 def test_clashes_of_any_session_fail_on_clash(
     run: Run, tmp_path: Path, sessions: list[Path], layouts: list[Path]
 ) -> None:
@@ -202,6 +209,7 @@ def test_clashes_of_any_session_fail_on_clash(
     assert run(*arguments(sessions, [near], tmp_path / "b", "--fail-on-clash")) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ann__near.h5", "COMPARISON.csv"])
 def test_what_stands_in_the_folder_is_refused_before_any_work(
     run: Run,

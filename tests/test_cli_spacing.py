@@ -69,6 +69,7 @@ def test_silhouettes_are_grown_on_demand_and_that_is_said(
     assert capsys.readouterr().out.splitlines()[0].endswith(", silhouettes grown by 2 px")
 
 
+@pytest.mark.slow
 def test_the_shift_at_95_percent_is_told_and_grows_with_the_outlines_errors(
     run: Run, task: list[object], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -96,6 +97,7 @@ def test_the_shift_at_95_percent_is_told_and_grows_with_the_outlines_errors(
     assert [one["at_95"] for one in printed["sessions"]] == [None, None]
 
 
+@pytest.mark.slow
 def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     run: Run, task: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,6 +19,7 @@ from hybridve.hull.contact.recovery import Recovery
 from hybridve.hull.contact.respond import Response
 from hybridve.hull.contact.uncertainty import Doubt
 from hybridve.hull.curves import write_curves
+from hybridve.hull.report import machine
 from hybridve.hull.report.read import read_report
 from hybridve.hull.report.schema import FrameResult, ReportHeader
 from hybridve.hull.report.summarize import failing, summarize
@@ -88,7 +89,7 @@ def verdict_on(finding: Finding, required_m: float) -> Finding:
 def path(tmp_path: Path) -> Path:
     path = tmp_path / "report.h5"
     header = ReportHeader(
-        command="hybridve detect",
+        run=machine.Run("hybridve detect", "", {}, ""),
         objects=({"name": "box", "required_clearance_m": 0.01, "closed": True},),
         settings={},
         rig={},
@@ -153,7 +154,7 @@ def test_the_summary_counts_bounds_dates_and_names(path: Path) -> None:
 
 def only(frames: list[Finding], path: Path, required_m: float = 0.0) -> dict[str, Any]:
     header = ReportHeader(
-        command="",
+        run=machine.Run("", "", {}, ""),
         objects=({"name": "box", "required_clearance_m": required_m, "closed": True},),
         settings={},
         rig={},

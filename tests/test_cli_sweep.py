@@ -67,7 +67,7 @@ def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     assert sweep.settings["session_sha256"]
     assert sweep.settings["viewports"] == [2, 4, 8]
     assert sweep.settings["repeats"] == 2
-    assert sweep.versions["numpy"] == np.__version__
+    assert sweep.run.versions["numpy"] == np.__version__
     image = cv2.imread(str(tmp_path / "sweep.png"))
     assert image is not None
     assert len(np.unique(image)) > 50
@@ -169,6 +169,7 @@ def test_engines_that_do_not_open_are_left_out_unless_they_were_named(
     assert len(read_sweep(tmp_path / "sweep.h5").engines) == 2, "the sweep from before is kept"
 
 
+@pytest.mark.slow
 def test_the_reference_is_left_out_where_it_would_take_long(
     run: Run,
     tmp_path: Path,

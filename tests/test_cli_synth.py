@@ -48,6 +48,7 @@ def test_the_help_names_every_preset(run: Run, capsys: pytest.CaptureFixture[str
         assert [words[0] for words in lines if words].count(name) == 1
 
 
+@pytest.mark.slow
 def test_what_was_chosen_stands_in_the_files(folder: Path) -> None:
     truth = read_truth(folder)
     scene = load_scene(folder / "scene.toml")
@@ -61,6 +62,7 @@ def test_what_was_chosen_stands_in_the_files(folder: Path) -> None:
     assert required == pytest.approx({"pmt": 0.002, "payload_a": 0.005, "payload_b": 0.01})
 
 
+@pytest.mark.slow
 def test_the_spacing_reads_back_as_it_was_asked(folder: Path) -> None:
     found = read_truth(folder).spacing["payload_a"]
 
@@ -83,6 +85,7 @@ def test_the_spacing_reads_back_as_it_was_asked(folder: Path) -> None:
     assert found.needed_hull_m >= found.needed_m
 
 
+@pytest.mark.slow
 def test_the_ball_and_the_curtain_are_sessions_with_a_scene(synth: Callable[..., Path]) -> None:
     for preset, names in (("ball", ["ball"]), ("curtain", ["curtain", "window"])):
         folder = synth(preset, "--n-frames", 3)

@@ -10,20 +10,15 @@ from helpers.hulls import ball_hull, ball_masks, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.scene import SceneObject
-from hybridve.hull.contact.backtrack import (
-    FirstContact,
-    _patch,
-    approach_speed,
-    first_contact,
-    interpolate_masks,
-    interpolated_hull,
-)
+from hybridve.hull.contact.backtrack import FirstContact, _patch, approach_speed, first_contact
+from hybridve.hull.contact.between import interpolated_hull
 from hybridve.hull.contact.detect import (
     Body,
     certify_contacts,
     detect_contacts,
     make_body,
 )
+from hybridve.hull.contact.outline_motion import interpolate_masks
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points
@@ -310,6 +305,7 @@ def test_samples_touch_after_the_surface_does_and_soon(
     np.testing.assert_allclose(sampled.point_world, certain.point_world, atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_point_lies_amid_the_patch_of_first_contact(
     certifier: Certifier, engine: Native
 ) -> None:

@@ -166,6 +166,7 @@ def hulls(draw: st.DrawFn) -> Hull:
     return make_hull(views, random_masks(rng, views, rng.choice(MASK_KINDS, n_cameras).tolist()))
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(hull=hulls(), seed=st.integers(0, 2**32 - 1))
 def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
@@ -189,6 +190,7 @@ def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
         assert (found == found[0]).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(2, 5), n_balls=st.integers(1, 4))
 @example(seed=242, n_cameras=2, n_balls=1)
@@ -241,6 +243,7 @@ def test_cells_have_a_size() -> None:
         connected_volumes(ball_hull(ring_views(), np.zeros(3), 0.1), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_a_hand_whose_arm_one_silhouette_lacks_is_a_volume_of_its_own_and_real(
     recordings: Path, monkeypatch: pytest.MonkeyPatch

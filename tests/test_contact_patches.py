@@ -66,6 +66,7 @@ def found_in(hull: Hull, part: SceneObject) -> tuple[ClearanceMeter, Contact]:
     return meter, contact
 
 
+@pytest.mark.slow
 def test_two_balls_that_touch_one_plate_are_two_patches() -> None:
     hull, part = balls(looking_down(), CENTERS), plate(0.03)
     meter, contact = found_in(hull, part)
@@ -124,6 +125,7 @@ def test_what_is_nearer_than_required_is_a_patch_with_bounds_of_its_own(
         assert min(patch.clearance_m[0] for patch in patches) <= whole.upper_m
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_patches_share_out_the_points_and_the_nearest_of_them_is_the_clearance(seed: int) -> None:

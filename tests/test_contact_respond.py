@@ -128,6 +128,7 @@ def answers(request: pytest.FixtureRequest) -> list[tuple[Case, Response]]:
     return found
 
 
+@pytest.mark.slow
 def test_the_distance_lies_between_the_outlines_of_half_a_pixel(
     answers: list[tuple[Case, Response]],
 ) -> None:

@@ -66,6 +66,7 @@ def slab(
     return MovedObject(meter, clearance_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clearance_m", [0.0, 0.005, 0.1])
 @pytest.mark.parametrize("is_closed", [True, False])
 @pytest.mark.parametrize("begin_m", [0.0, -0.07])
@@ -85,6 +86,7 @@ def test_a_wall_must_go_as_far_as_the_ball_reaches_and_the_clearance(
     assert not covers(blocked.undecided_m, np.array([needed_m + PIXEL_M + 0.5e-3])).any()
 
 
+@pytest.mark.slow
 def test_a_thin_plate_blocks_all_the_way_through_the_ball_after_few_measurements(
     ball: Hull, side: NDArray[np.float64]
 ) -> None:
@@ -112,6 +114,7 @@ def test_what_is_wholly_inside_an_object_violates_it_though_nothing_crosses_the_
     assert verdict_at(ball, shell, move, 0.0) == "keeps"
 
 
+@pytest.mark.slow
 def test_nothing_is_blocked_far_away_or_where_nothing_is_real(
     ball: Hull, views: Views, side: NDArray[np.float64]
 ) -> None:

@@ -9,6 +9,7 @@ from helpers.hulls import ball_hull
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from hybridve.hull.contact.outline_errors import OutlineErrors
 from hybridve.hull.contact.spacing import (
     NOTHING,
     Move,
@@ -19,7 +20,7 @@ from hybridve.hull.contact.spacing import (
     union,
 )
 from hybridve.hull.contact.spacing_doubt import UnsureShifts, unsure_shifts
-from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubter, OutlineErrors
+from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubter
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
 
@@ -103,12 +104,14 @@ def test_what_violates_or_is_undecided_is_never_sure(
     assert found.std_m > 0
 
 
+@pytest.mark.slow
 def test_larger_errors_need_more_room(task: ErringTask, hull: Hull) -> None:
     ends_m = [unsure(task, hull, px).unsure_m[-1, 1] for px in (0.0, 0.5, 1.0, 2.0)]
 
     assert (np.diff(ends_m) > 0).all()
 
 
+@pytest.mark.slow
 def test_of_several_objects_each_is_kept_with_its_own_deviation(
     task: ErringTask, hull: Hull
 ) -> None:
@@ -169,6 +172,7 @@ def test_known_shifts_are_not_asked_for_again(task: ErringTask, hull: Hull) -> N
     assert blocked_by(hull, wall, move, everything)[2] == 0
 
 
+@pytest.mark.slow
 def test_the_shift_at_95_percent_suffices_in_95_percent_of_recordings() -> None:
     """Two frames, the first decides. 200 repeats and more: tests/benchmarks/bench_spacing_doubt."""
     rng = np.random.default_rng(11)

@@ -17,17 +17,10 @@ from hybridve.calib.pose import moved_pose
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.verdict import RigTest
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
+from hybridve.hull.contact.cones import metres_per_pixel
 from hybridve.hull.contact.detect import Contact
-from hybridve.hull.contact.uncertainty import (
-    ONE_SIDED_95,
-    Doubt,
-    Doubter,
-    DoubtSettings,
-    OutlineErrors,
-    metres_per_pixel,
-    outline_errors,
-    without_camera,
-)
+from hybridve.hull.contact.outline_errors import DoubtSettings, OutlineErrors, outline_errors
+from hybridve.hull.contact.uncertainty import ONE_SIDED_95, Doubt, Doubter, without_camera
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 
@@ -163,6 +156,7 @@ def test_std_grows_in_proportion_to_the_errors_and_adds_up_in_squares() -> None:
     assert one.sigma_px == pytest.approx(np.sqrt(0.09 + 0.64 + 0.04 + 1.0 / 12.0))
 
 
+@pytest.mark.slow
 def test_the_true_hull_is_at_least_so_far_away_in_95_percent_of_recordings() -> None:
     # Outlines and cameras are disturbed, drawn in pixels, and the true cones' hull is kept aside.
     rng = np.random.default_rng(4)
@@ -197,6 +191,7 @@ def test_the_true_hull_is_at_least_so_far_away_in_95_percent_of_recordings() -> 
     assert 0.67 < np.std(pulls) < 1.33
 
 
+@pytest.mark.slow
 def test_a_rig_that_knows_its_covariance_tells_how_clearances_scatter() -> None:
     """Cameras that err together: the hull of where they are thought to be, over many rigs."""
     rng = np.random.default_rng(8)
@@ -298,6 +293,7 @@ def without_others(views: Views, camera: int) -> Views:
     )
 
 
+@pytest.mark.slow
 def test_where_outlines_explain_nothing_the_clearance_is_measured_again() -> None:
     # One pixel of one camera: no outline has a direction there.
     views = ring_views(3)

@@ -41,6 +41,7 @@ def put(session: Path, camera: int, frame: int, value: int) -> None:
     cv2.imwrite(str(session.parent / f"cam{camera}" / f"{frame}.png"), mask)
 
 
+@pytest.mark.slow
 def test_a_contradiction_is_a_row_of_its_own_and_splits_no_contact(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

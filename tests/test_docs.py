@@ -90,6 +90,15 @@ def test_every_page_is_one_click_from_the_readme() -> None:
     assert {PROJECT / page for page in PAGES} - linked == {README}
 
 
+@pytest.mark.parametrize("package", ["calib", "hull"])
+def test_the_page_of_a_package_tells_of_each_of_its_rooms(package: str) -> None:
+    text = (PROJECT / package / "README.md").read_text(encoding="utf-8").split("## Rooms")[1]
+
+    rooms = {path.parent.name for path in (PROJECT / package).glob("*/__init__.py")}
+
+    assert {name for name in rooms if f"\n  {name}/" not in text} == set()
+
+
 def test_the_readme_is_a_face_and_not_the_whole() -> None:
     assert README.stat().st_size <= 13_000
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,6 +26,7 @@ def drawn_now() -> list[list[float]]:
     return examples
 
 
+@pytest.mark.slow
 def test_modules_that_are_loaded_by_chance_change_no_example(tmp_path: Path) -> None:
     # Their numbers would be drawn, if they were read, five times in a hundred.
     (tmp_path / "odd.py").write_text(f"ODD = {[k / 1000.3 for k in range(1, 1000)]}\n")
@@ -67,6 +69,7 @@ def asked(tmp_path: Path, *options: str, ci: str = "") -> list[str]:
     return [line for line in done.stdout.splitlines() if line.startswith("asked")]
 
 
+@pytest.mark.slow
 def test_examples_are_the_same_in_every_run_and_new_ones_follow_from_the_seed(
     tmp_path: Path,
 ) -> None:

@@ -35,6 +35,7 @@ def tools() -> Iterator[Tools]:
     tools.close()
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.parametrize(("case", "column"), list(cells()))
 def test_a_hard_case_has_the_right_answer(case: Case, column: str, tools: Tools) -> None:

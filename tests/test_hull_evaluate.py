@@ -19,8 +19,8 @@ from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import Chain, EvaluateSettings, make_chain
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
+from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.respond import ResponseSettings
-from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
@@ -103,6 +103,7 @@ def hits(results: list[FrameResult]) -> list[Finding | None]:
     return [result.findings[0] if result.is_valid else None for result in results]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skip", range(1, len(CENTERS) + 1))
 def test_frames_taken_up_anywhere_are_the_same_to_the_bit(
     session: Path, scene: Path, engine: Engine, results: list[FrameResult], skip: int
@@ -223,6 +224,7 @@ def test_a_hull_that_comes_from_nowhere_has_no_speed(
     assert found[2].first_contact_uncertainty_s == 0.5 / FPS
 
 
+@pytest.mark.slow
 def test_something_wholly_inside_a_closed_object_is_told_and_in_an_open_one_is_not(
     tmp_path: Path, session: Path, engine: Engine
 ) -> None:

@@ -81,12 +81,13 @@ def test_without_a_cache_nothing_is_kept(
     assert sorted(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
+@pytest.mark.slow
 def test_without_a_cache_code_is_compiled_all_the_same(tmp_path: Path) -> None:
     code = (
         "import numpy as np\n"
-        "from hybridve.hull.jit import FOLDER\n"
+        "from hybridve.hull.jit import folder\n"
         "from hybridve.hull.capture.background import learn_background\n"
-        "print(FOLDER, learn_background([np.full((2, 2, 3), 7, np.uint8)]).mean.sum())"
+        "print(folder(), learn_background([np.full((2, 2, 3), 7, np.uint8)]).mean.sum())"
     )
     environment = os.environ | {"HYBRIDVE_CACHE": "off", "XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("NUMBA_CACHE_DIR", None)
@@ -135,6 +136,16 @@ def test_in_a_folder_that_the_user_names_nothing_is_removed(
     assert (base / ("a" * 16)).exists()
 
 
+def test_to_load_what_is_compiled_touches_no_folder(tmp_path: Path) -> None:
+    environment = os.environ | {"HYBRIDVE_CACHE": str(tmp_path / "cache")}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    code = "import hybridve.hull.prepare, hybridve.hull.evaluate"
+
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.fixture
 def prepared(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     """The folder of what was prepared, and an environment in which it is found.
@@ -145,7 +156,7 @@ def prepared(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     if not prepare.is_prepared():
         environment["HYBRIDVE_CACHE"] = str(tmp_path / "cache")
         environment.pop("NUMBA_CACHE_DIR", None)
-    code = "from hybridve.hull.prepare import *; print(prepare_kernels(), FOLDER)"
+    code = "from hybridve.hull.prepare import *; print(prepare_kernels(), folder())"
     shown = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True
     )
@@ -154,6 +165,7 @@ def prepared(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     return Path(folder), environment
 
 
+@pytest.mark.slow
 def test_after_preparing_detect_compiles_nothing(
     prepared: tuple[Path, dict[str, str]], tmp_path: Path
 ) -> None:
@@ -192,11 +204,11 @@ def test_nothing_is_compiled_that_is_done_or_would_not_be_kept(
 ) -> None:
     runs = []
     monkeypatch.setattr(prepare, "_run_kernels", lambda: runs.append(gc.isenabled()))
-    monkeypatch.setattr(prepare, "FOLDER", None)
+    monkeypatch.setattr(prepare, "folder", lambda: None)
     assert not prepare.prepare_kernels()
     assert runs == []
 
-    monkeypatch.setattr(prepare, "FOLDER", tmp_path)
+    monkeypatch.setattr(prepare, "folder", lambda: tmp_path)
     assert not prepare.is_prepared()
     assert prepare.prepare_kernels()
     assert prepare.prepare_kernels()

@@ -68,6 +68,7 @@ def scenes(draw: st.DrawFn) -> tuple[Hull, Triangles]:
     return hull, soup(views, corners, np.ones(12, np.int32))
 
 
+@pytest.mark.slow
 @examples
 @given(scene=scenes())
 def test_verdicts_are_those_of_the_specification(
@@ -84,6 +85,7 @@ def test_verdicts_are_those_of_the_specification(
         np.testing.assert_allclose(found.open_at_m[triangle], open_at_m, rtol=1e-9)
 
 
+@pytest.mark.slow
 @settings(examples, max_examples=30)
 @given(scene=scenes())
 def test_what_is_free_has_no_hit_at_any_viewport(
@@ -140,6 +142,7 @@ def test_what_collides_has_a_witness_on_the_triangle(
         assert (witness <= corners.max(axis=0) + 1e-12 * size_m).all()
 
 
+@pytest.mark.slow
 @examples
 @given(scene=scenes(), viewport=st.integers(1, 40))
 def test_samples_never_contradict_a_certificate(
@@ -231,6 +234,7 @@ def test_a_triangle_that_needs_too_many_cells_is_open_at_the_size_it_reached(
     assert 1e-4 < few[1] < 0.1
 
 
+@pytest.mark.slow
 @examples
 @given(scene=scenes(), n_threads=st.integers(1, 3))
 def test_a_mesh_is_what_its_triangles_are(

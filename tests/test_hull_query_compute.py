@@ -86,6 +86,7 @@ def random_scene(seed: int, n_triangles: int, n_cameras: int = 4) -> tuple[Hull,
 
 
 # The largest triangles span the image and more: float32 about a vertex would not do for them.
+@pytest.mark.slow
 @pytest.mark.parametrize("extent_m", [0.003, 0.05, 0.3, 1.5, 6.0])
 def test_a_large_image_is_sampled_to_a_thousandth_of_a_pixel(
     compute: Compute, extent_m: float
@@ -229,6 +230,7 @@ def test_a_mesh_beyond_the_hull_is_dropped_by_the_cluster(compute: Compute) -> N
     assert len(hits) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_rectangles_only_save_work(compute: Compute, context: moderngl.Context, seed: int) -> None:
     hull, mesh = random_scene(seed, 150, n_cameras=(2, 4, 9, 20)[seed % 4])
@@ -434,6 +436,7 @@ def test_buffers_grow_when_a_frame_overflows_them(
     assert len(found) == len(mesh) * 70 * 71 // 2  # all of it is inside
 
 
+@pytest.mark.slow
 def test_a_frame_too_large_for_the_device_is_asked_in_parts(
     context: moderngl.Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:

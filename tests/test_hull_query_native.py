@@ -1,5 +1,7 @@
 """The compiled engine: its rejection, its threads, its grids of samples."""
 
+import gc
+import weakref
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,7 @@ from hybridve.hull.query.reference import Reference
 from hybridve.hull.query.silhouettes import make_hull
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_queries", [1, 2], ids=["triangles", "clusters"])
 def test_only_what_rectangles_leave_open_is_sampled(
     monkeypatch: pytest.MonkeyPatch, n_queries: int
@@ -150,9 +153,12 @@ def test_the_same_mesh_serves_other_cameras() -> None:
 
 def test_what_is_kept_of_a_mesh_goes_with_it() -> None:
     hull = ball_hull(ring_views(), np.zeros(3), 0.2)
-    others = set(clusters_module._prepared)
-    kept = sphere_mesh(100)
+    mesh = sphere_mesh(100)
+    Native(1).query(hull, [mesh])
+    assert mesh.prepared is not None
+    kept = weakref.ref(mesh.prepared.surface.vertices_local)
 
-    Native(1).query(hull, [kept, sphere_mesh(200)])
+    del mesh
+    gc.collect()
 
-    assert set(clusters_module._prepared) - others == {kept}
+    assert kept() is None

@@ -266,6 +266,7 @@ def test_more_cameras_than_a_counter_counts_are_refused(
 
 # One cell a window: whether it needs double precision is decided for each triangle alone. About
 # 0.3 m it changes; what neither program drew, or both, would show.
+@pytest.mark.slow
 @pytest.mark.parametrize("extent_m", [0.003, 0.1, 0.2, 0.3, 0.5, 6.0])
 def test_a_large_image_is_sampled_to_a_thousandth_of_a_pixel(
     clean: moderngl.Context, extent_m: float
@@ -291,6 +292,7 @@ def test_a_large_image_is_sampled_to_a_thousandth_of_a_pixel(
         assert share_in_double == 0.0
 
 
+@pytest.mark.slow
 def test_triangles_of_ten_thousands_of_pixels_are_sampled_as_precisely(stencil: Stencil) -> None:
     """Their first sample lies far outside the image, and single precision would not do."""
     rng = np.random.default_rng(3)

@@ -214,6 +214,7 @@ def exact_spans(
     return spans
 
 
+@pytest.mark.slow
 def test_ends_are_those_of_rational_arithmetic() -> None:
     """Cameras and rays in small integers: projections to corners, from behind, from the centre."""
     rng = np.random.default_rng(0)

@@ -14,9 +14,10 @@ from hybridve.hull.cad.scene import Scene, load_scene
 from hybridve.hull.capture.recording import FrameRange, silhouettes_of
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import Chain, EvaluateSettings, make_chain
+from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.spacing import Move, covers, union
-from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.query.silhouettes import make_hull
+from hybridve.hull.report.machine import Run
 from hybridve.hull.report.spacing_file import (
     SessionSpacing,
     Spacing,
@@ -306,14 +307,14 @@ def test_what_is_written_is_read_back(
     with_doubt = replace(with_doubt, name="doubted")
     none_doubted = replace(found, name="nowhere", doubt=nowhere)
     spacing = Spacing(
-        "hybridve spacing", "a machine", "2003-04-27", {"numpy": "2"}, {"move": ["part"]},
+        Run("hybridve spacing", "a machine", {"numpy": "2"}, "2003-04-27"), {"move": ["part"]},
         (found, unbound, with_doubt, none_doubted),
     )  # fmt: skip
 
     write_spacing(path, spacing)
 
     assert spacing_as_dict(read_spacing(path)) == spacing_as_dict(spacing)
-    assert read_spacing(path).versions == {"numpy": "2"}
+    assert read_spacing(path).run.versions == {"numpy": "2"}
     assert list(tmp_path.iterdir()) == [path]
     with h5py.File(path, "r+") as file:
         missing: list[str] = []

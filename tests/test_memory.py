@@ -24,6 +24,7 @@ def peak_bytes(folder: Path, recordings: Path, frames: str) -> int:
     return usage.ru_maxrss * 1024
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_200_frames_take_no_more_memory_than_25(recordings: Path, tmp_path: Path) -> None:
     text = (DATA / "horseman" / "session.toml").read_text(encoding="utf-8")

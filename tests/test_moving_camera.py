@@ -20,7 +20,7 @@ from hybridve.calib.boards.board import Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError, SessionError
-from hybridve.calib.formats.rigs import read_rig, write_rig
+from hybridve.calib.formats.rig_json import read_rig, write_rig
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.placing.hand_eye import mount_camera
 from hybridve.calib.pose import Pose, compose, invert, transform
@@ -31,12 +31,14 @@ from hybridve.hull.capture.recording import stored_silhouettes
 from hybridve.hull.capture.rig import rig_digest
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import Chain, EvaluateSettings, make_chain, views_at
-from hybridve.hull.contact.backtrack import first_contact, interpolated_hull
+from hybridve.hull.contact.backtrack import first_contact
+from hybridve.hull.contact.between import interpolated_hull
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.detect import detect_contacts
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.spacing import Move
-from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubter
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.engine import Engine
@@ -255,6 +257,7 @@ def test_leaving_out_the_motion_gives_a_wrong_answer(
     assert fifth.clearance.lower_m > 0.05
 
 
+@pytest.mark.slow
 def test_a_mount_calibrated_from_noisy_boards_gives_the_same_answers(
     scene: Path, engine: Engine, tmp_path: Path, results: list[FrameResult]
 ) -> None:
@@ -318,6 +321,7 @@ def write_boards(folder: Path, board: Chessboard, noise_px: float) -> str:
     return '[target]\nkind = "chessboard"\n' + target + "\n".join(tables)
 
 
+@pytest.mark.slow
 def test_a_session_with_a_moving_camera_is_calibrated_and_evaluated(
     scene: Path, engine: Engine, tmp_path: Path, run: Run, results: list[FrameResult]
 ) -> None:
@@ -452,6 +456,7 @@ def test_the_local_origin_is_that_of_the_whole_recording(
         np.testing.assert_array_equal(views.img_from_local[:3], chain.views.img_from_local[:3])
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 def test_engines_that_keep_things_from_frame_to_frame_agree(chain: Chain, engine: Engine) -> None:
     from hybridve.hull.query.compute import Compute
@@ -523,6 +528,7 @@ def test_stored_silhouettes_serve_until_the_poses_change(
     )
 
 
+@pytest.mark.slow
 def test_spacing_sweep_and_pictures_see_the_cameras_where_they_were(
     chain: Chain, scene: Path, engine: Engine
 ) -> None:

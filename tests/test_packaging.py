@@ -1,5 +1,9 @@
-"""What is shipped: the wheel holds the package, its shaders and nothing else."""
+"""What is shipped: the wheel holds the package, its shaders and nothing else.
 
+And what its modules keep to themselves.
+"""
+
+import ast
 import subprocess
 import sys
 import zipfile
@@ -54,3 +58,33 @@ def test_a_plain_import_of_the_folders_fails() -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd="/", check=False)
 
     assert done.returncode == 0
+
+
+def private_names_of_others(source: str) -> list[str]:
+    """Return the names with a leading underscore that a module takes from others."""
+    tree = ast.parse(source)
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = [alias for node in imports for alias in node.names]
+    taken = [alias.name for alias in names]
+    known = {alias.asname or alias.name for alias in names}
+    taken += [
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id in known
+    ]
+    return [name for name in taken if name.startswith("_") and not name.startswith("__")]
+
+
+def test_a_private_name_of_another_module_is_told() -> None:
+    source = "from a import _b, c\nfrom a import d as _d\nimport e\nc._f(e._g, e.h.__doc__, _d.i)"
+
+    assert private_names_of_others(source) == ["_b", "_f", "_g"]
+
+
+def test_no_module_takes_what_another_keeps_to_itself() -> None:
+    for folder in ("cli", "hull", "calib"):
+        for path in (PROJECT / folder).rglob("*.py"):
+            taken = private_names_of_others(path.read_text(encoding="utf-8"))
+            assert not taken, f"{path.relative_to(PROJECT)} takes {', '.join(taken)}"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridve.calib.formats.rigs import read_rig
+from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.record import CalibrationRecord
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import load_rig
@@ -109,6 +109,7 @@ def test_horseman_is_calibrated_as_others_did_and_stands_above_the_floor(horsema
         assert camera.intrinsics.rms_px <= 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "unit", "message"),
     [
@@ -168,6 +169,7 @@ def test_the_person_sits_on_the_floor_and_is_as_tall_as_a_person(horseman: Path)
     assert 0.08 < len(points) * 0.02**3 < 0.3, "a person and a chair, and the hull's bulge, in m3"
 
 
+@pytest.mark.slow
 def test_horseman_engines_find_the_same(run: Run, horseman: Path, tmp_path: Path) -> None:
     scene = DATA / "horseman" / "scene.toml"
     frames = {"native": ":", "compute": "0::5", "stencil": "0::10", "reference": "0::50"}
@@ -203,6 +205,7 @@ def test_horseman_engines_find_the_same(run: Run, horseman: Path, tmp_path: Path
         assert (certificates["native"][name] == "free").all(), name
 
 
+@pytest.mark.slow
 def test_collision_points_lie_in_the_hull(run: Run, horseman: Path, tmp_path: Path) -> None:
     path = tmp_path / "report.h5"
     scene = DATA / "horseman" / "scene.toml"
@@ -217,6 +220,7 @@ def test_collision_points_lie_in_the_hull(run: Run, horseman: Path, tmp_path: Pa
     assert is_inside.mean() > 0.9999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frame", "litres"), [(0, 49.46), (100, 51.89)])
 def test_the_hull_of_child_rope_has_the_known_volume(frame: int, litres: float) -> None:
     hull = hull_of(DATA / "child_rope", frame)
@@ -229,6 +233,7 @@ def test_the_hull_of_child_rope_has_the_known_volume(frame: int, litres: float) 
         np.testing.assert_allclose(points.max(axis=0), [0.628, 0.378, 1.188], atol=0.005)
 
 
+@pytest.mark.slow
 def test_detect_runs_on_ready_masks_and_given_matrices(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "report.h5"
     arguments = ["--scene", DATA / "child_rope" / "scene.toml", "-o", path, "--no-progress"]

@@ -26,8 +26,10 @@ from hybridve.hull.contact.uncertainty import Doubt
 from hybridve.hull.contact.verdict import VERDICTS
 from hybridve.hull.report import write
 from hybridve.hull.report.collisions import StoredMesh
+from hybridve.hull.report.machine import Run
 from hybridve.hull.report.read import read_points, read_report
-from hybridve.hull.report.schema import STAGES, CameraFrame, FrameResult, Kind, ReportHeader
+from hybridve.hull.report.result_file import Kind
+from hybridve.hull.report.schema import STAGES, CameraFrame, FrameResult, ReportHeader
 from hybridve.hull.report.summarize import spans, summarize
 from hybridve.hull.report.write import ReportWriter
 
@@ -48,7 +50,7 @@ ORIGIN_M = (4_000_000.0, -200.0, 0.0)
 
 def a_header(n_objects: int, **changes: Any) -> ReportHeader:
     values: dict[str, Any] = {
-        "command": "hybridve detect",
+        "run": Run("hybridve detect", "a machine", {}, ""),
         "objects": tuple({"name": f"object_{i}", "triangles": 12} for i in range(n_objects)),
         "settings": {"viewport": 10},
         "rig": {"cameras": []},
@@ -172,6 +174,7 @@ def datasets(path: Path, *, but: str = "stage_s") -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results())
 def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]) -> None:
@@ -305,6 +308,7 @@ COLUMNS_OF_CONTACT = {
 }
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results())
 def test_every_column_is_read_back_and_what_is_missing_is_nan_nought_or_empty(
@@ -353,6 +357,7 @@ def test_a_column_with_a_number_for_each_camera_names_them(tmp_path: Path) -> No
         assert tuple(column.attrs["cameras"]) == CAMERAS
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results(), data=st.data())
 def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
@@ -379,6 +384,7 @@ def test_a_run_that_was_cut_off_and_taken_up_gives_the_same_report(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["resumed.h5", "whole.h5"]
 
 
+@pytest.mark.slow
 @_FEW
 @given(results=frame_results(), data=st.data())
 def test_vtk_reads_the_points_of_every_frame(

@@ -29,6 +29,7 @@ from hybridve.hull.query.engine import Engine, Hits, Triangles
 from hybridve.hull.query.reference import Reference, contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull, make_views
 from hybridve.hull.report import sweep_file
+from hybridve.hull.report.machine import Run
 from hybridve.hull.report.sweep_file import Sweep, held, read_sweep, sweep_as_dict, write_sweep
 from hybridve.hull.sweep.cost import fit_cost, window_px_read
 from hybridve.hull.sweep.experiment import Outcome, run_sweep
@@ -441,7 +442,7 @@ def test_without_certificates_the_dense_samples_alone_make_the_truth() -> None:
         blind.engines[0].triangles_missed, seeing.engines[0].triangles_missed
     )
     found = (blind.rows, blind.frames, blind.truth, blind.engines)
-    json.dumps(sweep_as_dict(Sweep("", "", "", {}, {}, N_CAMERAS, *found)), allow_nan=False)
+    json.dumps(sweep_as_dict(Sweep(Run("", "", {}, ""), {}, N_CAMERAS, *found)), allow_nan=False)
 
 
 def test_frames_with_the_same_answer_are_each_measured_by_their_own_truth() -> None:
@@ -677,10 +678,7 @@ def some_sweep() -> Sweep:
     )
     first, second = outcome.engines
     return Sweep(
-        command="hybridve sweep",
-        machine="a machine",
-        created_utc="2026-01-01T00:00:00+00:00",
-        versions={"python": "3"},
+        run=Run("hybridve sweep", "a machine", {"python": "3"}, "2026-01-01T00:00:00+00:00"),
         settings={"frames": "0:1:1", "objects": [{"name": "thing", "triangles": 12}]},
         cameras=N_CAMERAS,
         rows=outcome.rows,
@@ -707,7 +705,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, some_sweep: Sweep) -> None
     back = read_sweep(path)
     assert sweep_as_dict(back) == sweep_as_dict(some_sweep)
     assert back.settings == some_sweep.settings
-    assert back.versions == some_sweep.versions
+    assert back.run == some_sweep.run
     np.testing.assert_array_equal(back.engines[0].query_s, some_sweep.engines[0].query_s)
     assert [engine.name for engine in back.engines] == ["reference", "without a model"]
     assert back.engines[1].cost is None

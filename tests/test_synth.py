@@ -74,6 +74,7 @@ def scene(folder: Path) -> Scene:
     return load_scene(folder / "scene.toml")
 
 
+@pytest.mark.slow
 def test_what_is_written_is_a_session_with_all_its_pictures(session: Session, truth: Truth) -> None:
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in truth.cameras}
     assert [camera.name for camera in session.cameras] == list(sizes)
@@ -92,6 +93,7 @@ def test_what_is_written_is_a_session_with_all_its_pictures(session: Session, tr
         }
 
 
+@pytest.mark.slow
 def test_cameras_differ_and_see_the_working_volume(truth: Truth) -> None:
     volume = np.array([[x, y, z] for x in (0.1, 0.7) for y in (-0.1, 0.5) for z in (0.0, 0.9)])
     for camera in truth.cameras:
@@ -102,6 +104,7 @@ def test_cameras_differ_and_see_the_working_volume(truth: Truth) -> None:
     assert len({camera.width_px for camera in truth.cameras}) > 1
 
 
+@pytest.mark.slow
 def test_lenses_never_fold(truth: Truth) -> None:
     for camera in truth.cameras:
         k1, k2 = camera.params[4:6]
@@ -109,6 +112,7 @@ def test_lenses_never_fold(truth: Truth) -> None:
         assert 9 * k1**2 < 20 * k2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera_index", range(4))
 def test_board_corners_lie_where_the_lens_puts_them(
     session: Session, truth: Truth, camera_index: int
@@ -137,6 +141,7 @@ def test_board_corners_lie_where_the_lens_puts_them(
     assert np.abs(np.mean(all_errors_px, axis=(0, 1))).max() < CORNER_BIAS_PX
 
 
+@pytest.mark.slow
 def test_stills_reach_the_corners_of_the_image_and_are_tilted(truth: Truth) -> None:
     board = Chessboard(8, 5, 0.1)
     for camera in truth.cameras:
@@ -155,6 +160,7 @@ def test_stills_reach_the_corners_of_the_image_and_are_tilted(truth: Truth) -> N
         assert tilts_deg.max() < 50
 
 
+@pytest.mark.slow
 def test_only_silhouettes_and_soft_shadows_tell_frames_from_the_background(
     session: Session, truth: Truth, folder: Path
 ) -> None:
@@ -206,6 +212,7 @@ def test_the_shadow_of_a_ball_lies_in_line_with_the_lamp_and_is_soft() -> None:
     assert 0.6 * ring < penumbra < 1.1 * ring
 
 
+@pytest.mark.slow
 def test_shadows_lie_on_the_floor_where_cameras_see_it() -> None:
     stage = PRESETS["boxes"].make_stage()
     x, y = np.meshgrid(np.linspace(-0.3, 0.9, 9), np.linspace(-0.3, 0.7, 9))
@@ -223,6 +230,7 @@ def test_shadows_lie_on_the_floor_where_cameras_see_it() -> None:
         np.testing.assert_allclose(np.stack(found, axis=1), expected, atol=0.1)
 
 
+@pytest.mark.slow
 def test_objects_behave_as_the_preset_says(truth: Truth) -> None:
     payload_a, payload_b = truth.objects["payload_a"], truth.objects["payload_b"]
     bracket, shelf = truth.objects["bracket"], truth.objects["shelf"]
@@ -243,6 +251,7 @@ def test_objects_behave_as_the_preset_says(truth: Truth) -> None:
     assert rotated == ["bracket"]
 
 
+@pytest.mark.slow
 def test_while_it_collides_an_object_has_no_clearance_and_else_no_penetration(
     truth: Truth,
 ) -> None:
@@ -251,6 +260,7 @@ def test_while_it_collides_an_object_has_no_clearance_and_else_no_penetration(
         np.testing.assert_array_equal(found.collides, found.clearance_m == 0)
 
 
+@pytest.mark.slow
 def test_the_hull_is_no_farther_than_the_shapes_and_says_so_only_within_its_reach(
     truth: Truth,
 ) -> None:
@@ -265,6 +275,7 @@ def test_the_hull_is_no_farther_than_the_shapes_and_says_so_only_within_its_reac
         assert (found.hull_clearance_m[~np.isnan(found.hull_clearance_m)] <= 0.1).all()
 
 
+@pytest.mark.slow
 def test_contacts_begin_between_the_frames_that_show_them(truth: Truth) -> None:
     for found in truth.objects.values():
         began = np.flatnonzero(found.collides[1:] & ~found.collides[:-1])
@@ -279,6 +290,7 @@ def test_contacts_begin_between_the_frames_that_show_them(truth: Truth) -> None:
     assert len(truth.objects["shelf"].contact_times_s) == 0
 
 
+@pytest.mark.slow
 def test_clearances_and_penetrations_are_those_of_the_files_written(
     truth: Truth, scene: Scene
 ) -> None:
@@ -308,6 +320,7 @@ def test_clearances_and_penetrations_are_those_of_the_files_written(
             assert np.sqrt((offsets**2).sum(axis=1).min()) < spacing_m
 
 
+@pytest.mark.slow
 def test_the_hull_of_the_true_silhouettes_touches_what_the_true_shapes_touch(
     truth: Truth, scene: Scene, folder: Path
 ) -> None:
@@ -344,6 +357,7 @@ def test_the_hull_of_the_true_silhouettes_touches_what_the_true_shapes_touch(
                 assert not contains_points(hull, samples).any()
 
 
+@pytest.mark.slow
 def test_shapes_that_move_as_one_stay_together(truth: Truth) -> None:
     # The forearm's near end lies in the fist, the rod's in the ball, in every frame.
     for name, other in (("forearm", "fist"), ("rod", "ball")):
@@ -377,6 +391,7 @@ def test_real_things_do_not_run_through_each_other() -> None:
                         assert other_shape.signed_distance(local)[0].min() > 0.02
 
 
+@pytest.mark.slow
 def test_every_dataset_says_what_it_is(folder: Path) -> None:
     found = []
 
@@ -392,6 +407,7 @@ def test_every_dataset_says_what_it_is(folder: Path) -> None:
     assert len(found) > 30
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_overwriting_leaves_nothing_old(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -409,6 +425,7 @@ def test_the_same_seed_gives_the_same_bytes_and_overwriting_leaves_nothing_old(
         assert (folder / name).read_bytes() == (again / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_a_taken_folder_is_refused_and_left_alone(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
 
@@ -454,6 +471,7 @@ def test_interrupted_it_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_not_there_is_refused(folder: Path) -> None:
     for frame in (-1, N_FRAMES):
         with pytest.raises(SessionError, match=f"there is no frame {frame}; it has {N_FRAMES}"):

@@ -93,6 +93,7 @@ def test_a_thing_far_away_may_move_as_it_likes() -> None:
     assert entry.moment == pytest.approx((0.35 - RADIUS_M - 0.1) / 0.4, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_the_pushed_block_meets_the_virtual_ball_when_its_eased_way_says() -> None:
     stage = PRESETS["ball"].make_stage()
 
@@ -182,6 +183,7 @@ def rooms() -> dict[int, tuple[Stage, Needed, Needed]]:
     return {participant: payload_room(participant) for participant in (1, 2, 3, 4)}
 
 
+@pytest.mark.slow
 def test_the_room_is_that_of_the_pipe_and_with_a_tool_that_of_the_tongs_on_end(
     rooms: dict[int, tuple[Stage, Needed, Needed]],
 ) -> None:
@@ -196,6 +198,7 @@ def test_the_room_is_that_of_the_pipe_and_with_a_tool_that_of_the_tongs_on_end(
         assert DECISIVE[by_shapes.frame] == (0.31 if participant == 1 else 0.68)
 
 
+@pytest.mark.slow
 def test_participants_with_the_tool_need_more_room_as_in_the_papers_table(
     rooms: dict[int, tuple[Stage, Needed, Needed]],
 ) -> None:
@@ -207,6 +210,7 @@ def test_participants_with_the_tool_need_more_room_as_in_the_papers_table(
     assert gaps_cm == pytest.approx(paper, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_hull_needs_more_room_than_the_shapes_but_level_cameras_keep_it_near(
     rooms: dict[int, tuple[Stage, Needed, Needed]],
 ) -> None:
@@ -215,6 +219,7 @@ def test_the_hull_needs_more_room_than_the_shapes_but_level_cameras_keep_it_near
         assert by_shapes.shift_m <= by_hull.shift_m < by_shapes.shift_m + 0.006
 
 
+@pytest.mark.slow
 def test_at_the_room_needed_all_keeps_its_distance_and_with_less_it_does_not() -> None:
     stage, by_shapes, by_hull = payload_room(2, gap_mm=180.0)
     part = stage.parts[1]

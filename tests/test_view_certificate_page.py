@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from helpers.boards import LENSES, look_at, make_camera, ring
-from helpers.records import make_record
+from helpers.records import make_opinion, make_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
-from hybridve.calib.errors import ReportError
+from hybridve.calib.errors import CalibrationError
 from hybridve.calib.judging.certificate import (
     Certificate,
     SeenPoints,
@@ -32,21 +32,13 @@ from hybridve.calib.judging.certificate import (
     working_volume,
 )
 from hybridve.calib.lens import cam_from_img, parameter_names, project_points
-from hybridve.calib.record import CalibrationRecord, Noise
+from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion
 from hybridve.calib.rig import POSE_PARAMETERS, Rig, RigCovariance
 from hybridve.calib.solving.covariance import point_errors
-from hybridve.hull.view.certificate_charts import (
-    CELLS,
-    binned_means,
-    cell_counts,
-    draw_camera,
-    draw_errors,
-    draw_rig,
-    frustum,
-    nice,
-    slice_errors,
-)
+from hybridve.hull.view.certificate_charts import CELLS, binned_means, cell_counts, draw_camera
 from hybridve.hull.view.certificate_page import render, state_of, write_certificate_page
+from hybridve.hull.view.chart_marks import nice
+from hybridve.hull.view.rig_charts import draw_errors, draw_rig, frustum, slice_errors
 
 NOISE_PX = 0.25
 NOISE = Noise(NOISE_PX, NOISE_PX, NOISE_PX * np.sqrt(2.0), 0.987, 1234, 56)
@@ -150,6 +142,7 @@ def page_of(
 # --- The page ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_certificate_says(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -188,6 +181,18 @@ def test_the_page_says_what_the_certificate_says(
     assert len(page.images()) == len(certificate.cameras) + 2
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_second_opinion_is_told_or_why_there_is_none(tmp_path: Path, is_there: bool) -> None:
+    rig, certificate, seen, volume = case_of(["left", "right"])
+    opinion = make_opinion(1.7) if is_there else NoOpinion("COLMAP has no <lens>")
+
+    page = page_of(tmp_path, (rig, replace(certificate, second_opinion=opinion), seen, volume))
+
+    told = ["1.7 mm", "1.7 standard deviations", "3.0 mm"] if is_there else ["COLMAP has no <lens>"]
+    for words in ("second opinion", *told):
+        assert words in page.text, words
+
+
 def test_nothing_is_fetched_and_nothing_runs(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -224,6 +229,7 @@ def test_markup_in_names_and_values_is_text(tmp_path: Path) -> None:
         ElementTree.fromstring(image)
 
 
+@pytest.mark.slow
 def test_equal_input_gives_the_same_bytes(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -248,6 +254,7 @@ def test_one_camera_has_a_page_without_millimetres(tmp_path: Path) -> None:
     assert len(page.images()) == 2  # no map
 
 
+@pytest.mark.slow
 def test_a_camera_that_saw_nothing_and_points_without_numbers_are_told(tmp_path: Path) -> None:
     rig, _, seen, volume = case_of(["blind", "half"])
     certificate = certify(rig, record_of(rig), {"half": seen["half"]}, volume)
@@ -306,12 +313,13 @@ def test_a_rig_without_covariance_or_of_other_cameras_is_refused(
         page_of(tmp_path, (rig.only(["right", "left"]), certificate, seen, volume))
 
 
+@pytest.mark.slow
 def test_a_page_cut_off_leaves_nothing(
     tmp_path: Path,
     two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(ReportError, match="cannot be written"):
+    with pytest.raises(CalibrationError, match="cannot be written"):
         page_of(tmp_path / "no", two)
 
     def interrupt(self: Path, *_: object, **__: object) -> None:
@@ -423,6 +431,7 @@ def arrows_of(figure: Figure) -> dict[str, Quiver]:
     return {"orange" if one.get_facecolor()[0][0] > 0.5 else "blue": one for one in found}
 
 
+@pytest.mark.slow
 def test_arrows_are_as_long_as_is_said_and_patterns_stand_out(
     two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume],
 ) -> None:
@@ -538,6 +547,7 @@ def row_of(count: int) -> list[Camera]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [draw_rig, draw_errors])
 @pytest.mark.parametrize("cameras", [ring(BOARD, ["PINHOLE"] * 16), row_of(6)], ids=["ring", "row"])
 def test_the_names_of_many_cameras_can_be_read_from_above(

@@ -110,6 +110,7 @@ def test_the_hull_of_a_ball_is_found_where_the_specification_finds_it(
     assert n_hits > 15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unseen", ["carve", "keep"])
 @pytest.mark.parametrize("parallel", [False, True])
 def test_any_hull_is_found_where_the_specification_finds_it(

@@ -8,7 +8,7 @@ import pycolmap
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose, compose, invert
-from hybridve.calib.record import MadeElsewhere
+from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Rig
 
 

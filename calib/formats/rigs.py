@@ -6,257 +6,31 @@ where its pixel centres lie, the images' size) is given by the caller, never gue
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats import caliscope, kalibr, multical, opencv, rows
-from hybridve.calib.formats.approximate import approximate
-from hybridve.calib.formats.colmap import read_colmap_model, write_colmap_model
+from hybridve.calib.formats.colmap import read_colmap_model
 from hybridve.calib.formats.foreign import (
     ForeignCamera,
     ForeignRig,
     principal_point_index,
     read_text,
 )
+from hybridve.calib.formats.rig_export import PLACEHOLDER, UNITS_M, metres_of
+from hybridve.calib.formats.rig_json import FORMAT, check_focal_lengths, read_rig
 from hybridve.calib.pose import nearest_to_axes
-from hybridve.calib.record import (
-    CalibrationRecord,
-    MadeElsewhere,
-    provenance_from_plain,
-    provenance_to_plain,
-)
-from hybridve.calib.rig import Mount, Rig, RigCovariance
-from hybridve.calib.verdict import RigTest
-
-FORMAT = "hybridve-rig"
-VERSION = 1
-
-#: Metres a unit of length; "squares" are those of the board.
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-
-_CONVENTIONS = {
-    "length": "metres",
-    "image": "pixels; the centre of the top-left pixel is (0.5, 0.5), x right, y down",
-    "camera frame": "x right, y down, z forward",
-    "cam_from_world": "[R | t], row by row: x_cam = R x_world + t",
-    "params": "the parameters of COLMAP's camera model, in COLMAP's order",
-    "skew_px": "entry (1, 2) of the camera matrix",
-    "covariance": "lower triangle, row by row; a camera's pose errors (rx ry rz, tx ty tz) are in "
-    "its own frame, radians and metres: R_true = exp(r) R, t_true = t + (tx, ty, tz)",
-    "mounts": "cam_from_world = cam_from_tracker, then the inverse of the tracker's pose, then "
-    "the inverse of world_from_tracking",
-}
-
-#: Stands for a camera's name in the path of a rig that is one file a camera.
-PLACEHOLDER = "{camera}"
+from hybridve.calib.provenance import MadeElsewhere
+from hybridve.calib.record import CalibrationRecord
+from hybridve.calib.rig import Rig, RigCovariance
 
 #: Condition number from which on optical axes are called parallel: all within some 6 degrees.
 _PARALLEL = 100.0
-
-#: The files of a COLMAP text model that are written.
-_COLMAP_FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
-
-#: OpenCV's models as targets of an approximation, with so many free parameters.
-_OPENCV_5 = (("FULL_OPENCV", 9), ("OPENCV_FISHEYE", 8))
-_OPENCV_8 = (("FULL_OPENCV", 12), ("OPENCV_FISHEYE", 8))
-_KALIBR_MODELS = (("OPENCV", 8), ("OPENCV_FISHEYE", 8), ("EUCM", 6), ("FOV", 5))
-
-
-@dataclass(frozen=True, slots=True)
-class _Target:
-    """A format to write: what it can hold, and what of a rig stays behind.
-
-    Attributes
-    ----------
-    refusal : callable
-        Why it cannot hold a camera, or None.
-    substitutes : tuple of (str, int)
-        The lens models to approximate another one with; see `approximate`.
-    unit : str or None
-        The unit that it fixes.
-    """
-
-    refusal: Callable[[Camera], str | None]
-    substitutes: tuple[tuple[str, int], ...] = ()
-    unit: str | None = None
-
-
-def _colmap_refusal(camera: Camera) -> str | None:
-    return f"a skew of {camera.skew_px:.3g} px" if camera.skew_px else None
-
-
-_TARGETS = {
-    "json": _Target(lambda _: None, unit="m"),
-    "colmap": _Target(_colmap_refusal),
-    "opencv": _Target(opencv.refusal, _OPENCV_8),
-    "csv": _Target(rows.refusal),
-    "caliscope": _Target(caliscope.refusal, _OPENCV_5, unit="m"),
-    "aniposelib": _Target(caliscope.refusal, _OPENCV_5),
-    "kalibr": _Target(kalibr.refusal, _KALIBR_MODELS, unit="m"),
-    "multical": _Target(multical.refusal, _OPENCV_8),
-}
-
-#: The short names of the formats that are written, and read.
-FORMATS = tuple(_TARGETS)
-
-
-@dataclass(frozen=True, slots=True)
-class Written:
-    """What became of a rig in another format.
-
-    Attributes
-    ----------
-    files : tuple of Path
-        The files written.
-    approximated : dict of str to dict
-        For each camera whose lens the format does not have: "model", what stands for it, and
-        "error_px", the largest distance between the two images of a ray.
-    lost : tuple of str
-        What of the rig the format has no place for, in words.
-    """
-
-    files: tuple[Path, ...]
-    approximated: dict[str, dict[str, Any]]
-    lost: tuple[str, ...]
-
-
-def rig_to_dict(rig: Rig) -> dict[str, Any]:
-    """Return a rig as the plain JSON values of a rig.json, with all digits."""
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "conventions": _CONVENTIONS,
-        "cameras": [
-            {
-                "name": camera.name,
-                "model": camera.model,
-                "width_px": camera.width_px,
-                "height_px": camera.height_px,
-                "params": camera.params.tolist(),
-                "skew_px": camera.skew_px,
-                "cam_from_world": camera.cam_from_world.tolist(),
-            }
-            for camera in rig.cameras
-        ],
-        **_covariance_to_dict(rig.covariance),
-        **_mounts_to_dict(rig.mounts),
-        "provenance": provenance_to_plain(rig.provenance) | _check_to_dict(rig.check),
-    }
-
-
-def _check_to_dict(check: RigTest | None) -> dict[str, Any]:
-    return {} if check is None else {"check": check.to_dict()}
-
-
-def _covariance_to_dict(covariance: RigCovariance | None) -> dict[str, Any]:
-    if covariance is None:
-        return {}
-    rows = [row[: index + 1].tolist() for index, row in enumerate(covariance.matrix)]
-    return {"covariance": {"labels": list(covariance.labels), "matrix": rows}}
-
-
-def _mounts_to_dict(mounts: Mapping[str, Mount]) -> dict[str, Any]:
-    if not mounts:
-        return {}
-    return {
-        "mounts": {
-            name: {
-                "cam_from_tracker": mount.cam_from_tracker.tolist(),
-                "world_from_tracking": mount.world_from_tracking.tolist(),
-            }
-            for name, mount in mounts.items()
-        }
-    }
-
-
-def write_rig(path: Path, rig: Rig) -> None:
-    """Write a rig.json; the file appears only when it is complete."""
-    _write_texts({path: _rig_json(rig)})
-
-
-def _rig_json(rig: Rig) -> str:
-    return json.dumps(rig_to_dict(rig), indent=1, allow_nan=False) + "\n"
-
-
-def read_rig(path: Path) -> Rig:
-    """Read a rig.json.
-
-    Raises
-    ------
-    CalibrationError
-        If the file is missing, is not a rig, or is of a version that this program does not know.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise CalibrationError(f"{path}: not JSON ({error}); expected a rig.json") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, dict) else type(content).__name__
-        raise CalibrationError(f"{path}: format is {found!r}, expected {FORMAT!r}")
-    if content.get("version") != VERSION:
-        raise CalibrationError(
-            f"{path}: version {content.get('version')!r} is not known, expected {VERSION}; "
-            "calibrate again, or use the program that wrote it"
-        )
-    try:
-        cameras = tuple(
-            Camera(
-                name=str(entry["name"]),
-                model=str(entry["model"]),
-                width_px=int(entry["width_px"]),
-                height_px=int(entry["height_px"]),
-                params=np.array(entry["params"], dtype=np.float64),
-                cam_from_world=np.array(entry["cam_from_world"], dtype=np.float64),
-                skew_px=float(entry.get("skew_px", 0.0)),
-            )
-            for entry in content["cameras"]
-        )
-        for camera in cameras:
-            _check_focal_lengths(camera)
-        told = dict(content.get("provenance", {}))
-        check = RigTest.from_dict(told.pop("check")) if "check" in told else None
-        return Rig(
-            cameras,
-            provenance_from_plain(told),
-            _covariance_from_dict(content["covariance"]) if "covariance" in content else None,
-            {
-                str(name): Mount(
-                    np.array(entry["cam_from_tracker"], dtype=np.float64),
-                    np.array(entry["world_from_tracking"], dtype=np.float64),
-                )
-                for name, entry in content.get("mounts", {}).items()
-            },
-            check,
-        )
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from error
-    except KeyError as error:
-        raise CalibrationError(
-            f"{path}: a camera has no {error}, or a mount or the covariance; expected {FORMAT} 1"
-        ) from error
-    except (AttributeError, TypeError, ValueError) as error:
-        raise CalibrationError(f"{path}: {error}; expected {FORMAT} 1") from error
-
-
-def _covariance_from_dict(entry: Mapping[str, Any]) -> RigCovariance:
-    rows = [np.array(row, dtype=np.float64) for row in entry["matrix"]]
-    matrix = np.zeros((len(rows), len(rows)))
-    for index, row in enumerate(rows):
-        if row.shape != (index + 1,):
-            raise CalibrationError(
-                f"row {index + 1} of the covariance has shape {row.shape}, expected "
-                f"{(index + 1,)}: the lower triangle"
-            )
-        matrix[index, : index + 1] = matrix[: index + 1, index] = row
-    return RigCovariance(tuple(str(label) for label in entry["labels"]), matrix)
 
 
 def import_rig(
@@ -301,7 +75,7 @@ def import_rig(
     """
     if not image_sizes:
         raise CalibrationError(f"{pattern}: no camera is asked for; name at least one")
-    factor_m = None if unit is None else _metres(unit, square_m)
+    factor_m = None if unit is None else metres_of(unit, square_m)
     found = _read(root, pattern, list(image_sizes))
     if isinstance(found, Rig):
         return _choose(found, image_sizes, pattern)
@@ -342,7 +116,7 @@ def read_any_rig(
         Saying which file or camera, what was found and what was expected.
     """
     pattern = str(source)
-    factor_m = None if unit is None else _metres(unit, None)
+    factor_m = None if unit is None else metres_of(unit, None)
     wanted = list(names)
     if PLACEHOLDER in pattern and not wanted:
         wanted = _names_on_disk(source)
@@ -364,155 +138,6 @@ def read_any_rig(
             )
         sizes[name] = size_px
     return _to_rig(found, pattern, unit, factor_m, pixel_centre, sizes)
-
-
-def output_files(rig: Rig, to: str, target: Path) -> list[Path]:
-    """Return the files that `export_rig` writes.
-
-    Raises
-    ------
-    CalibrationError
-        If the format needs another kind of path.
-    """
-    if to == "colmap":
-        return [target / name for name in _COLMAP_FILES]
-    if to != "opencv":
-        if PLACEHOLDER in str(target):
-            raise CalibrationError(f"{target}: {to} is one file for all cameras; name one file")
-        return [target]
-    if target.suffix.lower() not in opencv.SUFFIXES:
-        raise CalibrationError(
-            f"{target}: OpenCV writes {', '.join(opencv.SUFFIXES)}; end the name with one of them"
-        )
-    if PLACEHOLDER not in str(target) and len(rig.cameras) > 1:
-        raise CalibrationError(
-            f"{target}: OpenCV's files hold one camera, the rig has {len(rig.cameras)}; put "
-            f"{PLACEHOLDER} into the path, or name one camera"
-        )
-    for camera in rig.cameras:
-        if PLACEHOLDER in str(target) and ("/" in camera.name or camera.name in {".", ".."}):
-            raise CalibrationError(f"{target}: {camera.name!r} cannot be part of a file's name")
-    return [Path(str(target).replace(PLACEHOLDER, camera.name)) for camera in rig.cameras]
-
-
-def export_rig(
-    rig: Rig, to: str, target: Path, *, unit: str | None = None, approximate_lenses: bool = False
-) -> Written:
-    """Write a rig in another format; all files stand complete, or none.
-
-    Parameters
-    ----------
-    rig : Rig
-        The rig.
-    to : str
-        One of `FORMATS`.
-    target : Path
-        The file; for "colmap" the folder; for "opencv", with more than one camera, a path with
-        the placeholder ``{camera}``.
-    unit : str or None
-        Of the translations: a key of `UNITS_M`. None: metres.
-    approximate_lenses : bool
-        Whether a lens model that the format lacks is replaced by the nearest that it has.
-
-    Raises
-    ------
-    CalibrationError
-        If the format cannot hold a camera, or the unit, or the files cannot be written.
-    """
-    known = _TARGETS[to]
-    unit = unit or "m"
-    unit_m = _metres(unit, None)
-    if known.unit not in {None, unit}:
-        raise CalibrationError(f"{target}: {to} is in {known.unit} by definition, not in {unit}")
-    files = output_files(rig, to, target)
-    cameras, approximated = [], {}
-    for camera in rig.cameras:
-        why = known.refusal(camera)
-        if why is not None:
-            reason = f"{target}: {to} cannot hold camera {camera.name!r}: it has {why}"
-            # Only another lens can be put in a lens's place.
-            if not known.substitutes or not camera.has_distortion:
-                raise CalibrationError(reason)
-            if not approximate_lenses:
-                raise CalibrationError(
-                    f"{reason}; --approximate takes the nearest lens it can hold"
-                )
-            camera, error_px = approximate(camera, known.substitutes)
-            approximated[camera.name] = {"model": camera.model, "error_px": error_px}
-        cameras.append(camera)
-    if to == "colmap":
-        moved = [
-            replace(c, cam_from_world=c.cam_from_world * [1.0, 1.0, 1.0, 1.0 / unit_m])
-            for c in cameras
-        ]
-        write_colmap_model(target, Rig(tuple(moved)))
-    else:
-        texts: dict[str, Callable[[], list[str]]] = {
-            "json": lambda: [_rig_json(rig)],
-            "opencv": lambda: [
-                opencv.write_opencv(camera, target.suffix.lower(), unit_m) for camera in cameras
-            ],
-            "csv": lambda: [rows.write_rows(cameras, unit_m)],
-            "caliscope": lambda: [caliscope.write_caliscope(cameras)],
-            "aniposelib": lambda: [caliscope.write_aniposelib(cameras, unit, unit_m)],
-            "kalibr": lambda: [kalibr.write_chain(cameras)],
-            "multical": lambda: [multical.write_multical(cameras, unit_m)],
-        }
-        _make_camera_folders(target, files)
-        _write_texts(dict(zip(files, texts[to](), strict=True)))
-    return Written(tuple(files), approximated, tuple(_lost(rig, to)))
-
-
-def _lost(rig: Rig, to: str) -> Iterable[str]:
-    """Say what of a rig a format has no place for."""
-    if to == "json":
-        return
-    names = [camera.name for camera in rig.cameras]
-    if to == "csv":
-        yield "the image sizes"
-    if to == "kalibr":
-        yield f"the world: it is the frame of {names[0]!r} now"
-        numbered = [f"cam{number}" for number in range(len(names))]
-    elif to == "caliscope":
-        numbered = [f"{number}" for number in caliscope.camera_ids(names)]
-    else:
-        numbered = names
-    if numbered != names:
-        pairs = (f"{number} is {name!r}" for number, name in zip(numbered, names, strict=True))
-        yield f"the cameras' names, which {to} passes over: {', '.join(pairs)}"
-    if rig.covariance is not None:
-        yield "the covariance"
-    if rig.mounts:
-        yield f"the mounts of {', '.join(rig.mounts)} on their trackers"
-
-
-def _make_camera_folders(target: Path, files: Sequence[Path]) -> None:
-    """Make the folders that are named after cameras; those above must be there."""
-    parent = target.parent
-    while PLACEHOLDER in str(parent):
-        parent = parent.parent
-    for path in files if parent.is_dir() else ():
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CalibrationError(f"{path.parent}: cannot be made ({error.strerror})") from error
-
-
-def _write_texts(texts: Mapping[Path, str]) -> None:
-    """Write text files, none under its final name before all are complete."""
-    partials = {path: path.with_name(path.name + ".partial") for path in texts}
-    try:
-        for path, text in texts.items():
-            partials[path].write_text(text, encoding="utf-8")
-        for path in texts:
-            partials[path].replace(path)
-    except OSError as error:
-        for partial in partials.values():
-            partial.unlink(missing_ok=True)
-        named = error.filename or next(iter(texts))
-        raise CalibrationError(
-            f"{str(named).removesuffix('.partial')}: cannot be written ({error.strerror})"
-        ) from error
 
 
 def _to_rig(
@@ -537,7 +162,7 @@ def _to_rig(
                 f"{pattern}: {found.format} does not say the unit of its lengths; name it: one of "
                 f"{', '.join(UNITS_M)}"
             )
-        factor_m = _metres(unit, None)
+        factor_m = metres_of(unit, None)
     chosen = {name: _foreign(found, name, pattern) for name in image_sizes}
     _refuse_mirrored(found, chosen, pattern)
     cameras = []
@@ -553,7 +178,7 @@ def _to_rig(
         width_px, height_px = (int(extent) for extent in size_px)
         try:
             camera = Camera(name, foreign.model, width_px, height_px, params, pose, foreign.skew_px)
-            _check_focal_lengths(camera)
+            check_focal_lengths(camera)
         except CalibrationError as error:
             raise CalibrationError(f"{pattern}: {error}") from error
         cameras.append(camera)
@@ -597,28 +222,6 @@ def _refuse_mirrored(found: ForeignRig, chosen: Mapping[str, ForeignCamera], pat
         )
 
 
-def _check_focal_lengths(camera: Camera) -> None:
-    """Refuse focal lengths that mirror a picture or turn it around.
-
-    Raises
-    ------
-    CalibrationError
-        If one is not above zero.
-    """
-    focal_px = np.diag(camera.pinhole)[:2]
-    if (focal_px > 0).all():
-        return
-    found = " and ".join(f"{value:g}" for value in focal_px)
-    if focal_px.prod() < 0:
-        why = "the picture is mirrored; flip it, and make both positive"
-    else:
-        why = (
-            "expected both above 0; where both are negative, the picture is upside down or the "
-            "camera looks the other way: turn its pose by 180 degrees"
-        )
-    raise CalibrationError(f"camera {camera.name!r}: focal lengths of {found} px: {why}")
-
-
 def _choose(rig: Rig, image_sizes: Mapping[str, tuple[int, int]], pattern: str) -> Rig:
     """Return the cameras asked for of a rig of ours, under the names asked for."""
     names = {rig.cameras[_pick(rig.cameras, name, pattern)].name: name for name in image_sizes}
@@ -648,21 +251,6 @@ def _check_size(found: tuple[int, int], wanted: tuple[int, int], name: str, patt
             "{}: camera {!r} is calibrated for images of {}x{}, those of the session are "
             "{}x{}; calibrate with the recorded size".format(pattern, name, *found, *wanted)
         )
-
-
-def _metres(unit: str, square_m: float | None) -> float:
-    if unit == "squares":
-        if square_m is None or not square_m > 0:
-            raise CalibrationError(
-                "the rig's unit is squares, but the board's square has no size; name the target "
-                "with its square"
-            )
-        return square_m
-    if unit not in UNITS_M:
-        raise CalibrationError(
-            f"the rig's unit {unit!r} is not known; one of {', '.join(UNITS_M)}, squares"
-        )
-    return UNITS_M[unit]
 
 
 def _foreign(found: ForeignRig, name: str, pattern: str) -> ForeignCamera:

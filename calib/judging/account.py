@@ -2,12 +2,13 @@
 
 import importlib.metadata
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Observations, is_seen
+from hybridve.calib.judging.certificate import working_volume
 from hybridve.calib.placing.fixed_cameras import Solved, other_tilt
 from hybridve.calib.placing.moments import PoseKey
 from hybridve.calib.placing.moving_cameras import Mounted
@@ -28,6 +29,7 @@ from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import POSE, BundleView
 from hybridve.calib.solving.covariance import camera_parameter_names
 from hybridve.calib.solving.lens_fit import FittedLens, rms
+from hybridve.calib.solving.second_opinion import second_opinion
 
 #: Outliers that are listed one by one.
 _TOLD_OUTLIERS = 50
@@ -104,6 +106,15 @@ def put_together(
         if solved is not None
         else Noise(lenses[0].noise_px, lenses[0].noise_px, lenses[0].rms_px, 1.0, 0, 0)
     )
+    rig = Rig(
+        cameras,
+        covariance=_whole_covariance(solved, mounted),
+        mounts={one.camera.name: one.mount for one in mounted},
+    )
+    opinion = None
+    if solved is not None:
+        volume = working_volume(rig, settings.box_world)
+        opinion = second_opinion(rig, solved.second, volume.points_world)
     record = CalibrationRecord(
         method=METHOD,
         software={
@@ -120,14 +131,9 @@ def put_together(
         world=None if solved is None else solved.world,
         settings={"lens": asdict(settings.lens), "observe": asdict(settings.observe)},
         adjustment=None if solved is None else _told_of_adjustment(solved),
+        second_opinion=opinion,
     )
-    rig = Rig(
-        cameras,
-        record,
-        covariance=_whole_covariance(solved, mounted),
-        mounts={one.camera.name: one.mount for one in mounted},
-    )
-    return Calibration(rig, record, pixels, residuals)
+    return Calibration(replace(rig, provenance=record), record, pixels, residuals)
 
 
 def _told_of_adjustment(solved: Solved) -> Adjustment:
@@ -138,6 +144,7 @@ def _told_of_adjustment(solved: Solved) -> Adjustment:
         worst_outliers=tuple(solved.outliers[:_TOLD_OUTLIERS]),
         left_out=dict(solved.linked.left_out),
         warnings=tuple(solved.linked.warnings),
+        start=solved.start,
     )
 
 

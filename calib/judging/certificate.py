@@ -17,7 +17,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.judging.twins import find_twins, twins_text
 from hybridve.calib.lens import cam_from_img, parameter_names
 from hybridve.calib.pose import invert, transform
-from hybridve.calib.record import CalibrationRecord, Noise
+from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.covariance import (
@@ -62,6 +62,9 @@ _BETTER = 0.8
 
 #: Noise of single points should explain this share of the residuals at least.
 _LEAST_EXPLAINED = 0.5
+
+#: A second opinion that differs by less is told as within this.
+_FINEST_M = 1e-6
 
 #: Residuals smaller than this explain nothing and need no explanation.
 _NEGLIGIBLE_PX = 0.01
@@ -202,6 +205,8 @@ class Certificate:
     doubts : tuple of str
         Those among them that make the stated errors void: what the pictures show contradicts itself
         or leaves the rig open. A quality gate must not pass such a rig.
+    second_opinion : SecondOpinion, NoOpinion or None
+        By how much COLMAP's own adjustment differs; None where all cameras move.
     """
 
     verdict: str
@@ -216,6 +221,7 @@ class Certificate:
     limit: Limit | None
     warnings: tuple[str, ...]
     doubts: tuple[str, ...] = ()
+    second_opinion: SecondOpinion | NoOpinion | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain JSON values; NaN becomes None."""
@@ -336,6 +342,7 @@ def certify(
         limit=limit,
         warnings=doubts + _warnings(record, cameras),
         doubts=doubts,
+        second_opinion=record.second_opinion,
     )
 
 
@@ -534,6 +541,18 @@ def _doubts(rig: Rig, record: CalibrationRecord) -> tuple[str, ...]:
     # One clip that was given twice counts as two: the errors that are stated are too small.
     twins = twins_text(find_twins(rig))
     return (*record.doubts, f"{twins}.") if twins else record.doubts
+
+
+def opinion_text(opinion: SecondOpinion | NoOpinion) -> str:
+    """Return a second opinion in words."""
+    if isinstance(opinion, NoOpinion):
+        return f"no second opinion: {opinion.reason}"
+    return (
+        "second opinion: COLMAP's own adjustment places what the cameras see within "
+        f"{millimetres(max(opinion.difference95_m, _FINEST_M))} mm of where the rig does (95 %), or "
+        f"{opinion.sigmas:.1f} standard deviations of its error, which is "
+        f"{millimetres(opinion.expected95_m)} mm (95 %)"
+    )
 
 
 def millimetres(length_m: float) -> str:

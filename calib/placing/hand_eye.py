@@ -101,7 +101,7 @@ def mount_camera(
     views, missed, untracked = make_views(
         camera, boards, sightings, tracking_from_tracker, world_from_board
     )
-    views, stuck = without_stuck(camera, views)
+    views, stuck = without_stuck(views)
     turn_deg = check_motion(camera, views, len(untracked), bool(stuck))
     views, chosen, fit = fit_mount(camera, views)
     missed |= stuck | {

@@ -123,9 +123,7 @@ def make_views(
     return views, missed, sorted(untracked)
 
 
-def without_stuck(
-    camera: Camera, views: list[MountedView]
-) -> tuple[list[MountedView], dict[str, str]]:
+def without_stuck(views: list[MountedView]) -> tuple[list[MountedView], dict[str, str]]:
     """Return views without those at which the tracker repeated itself and the camera had moved."""
     kept: list[MountedView] = []
     stuck: dict[str, str] = {}

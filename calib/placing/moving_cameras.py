@@ -40,14 +40,14 @@ def mount(
     CalibrationError
         If no board lies still, or as `hybridve.calib.placing.hand_eye.mount_camera`.
     """
-    world_from_board = None if solved is None else _still_boards(boards, seen, solved)
+    world_from_board = None if solved is None else _still_boards(seen, solved)
     mount, told = mount_camera(lens.camera, boards, seen.sightings, track, world_from_board)
     # A moving camera stands in the rig where it was in the middle of its clip.
     middle = mount.cam_from_world(track[told.middle_instant])
     return Mounted(replace(lens.camera, cam_from_world=middle), mount, told)
 
 
-def _still_boards(boards: Sequence[Board], seen: Observations, solved: "Solved") -> dict[int, Pose]:
+def _still_boards(seen: Observations, solved: "Solved") -> dict[int, Pose]:
     """Return where the boards lie that were still in the clip of the fixed cameras."""
     bundle, keys = solved.adjusted.bundle, solved.linked.pose_keys
     moments = Counter(key.body for key in keys if key.moment.is_clip)

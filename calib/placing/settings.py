@@ -3,6 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hybridve.calib.placing.marks import Mark
 from hybridve.calib.seeing.inputs import ObserveSettings
 from hybridve.calib.solving.lens_fit import LensSettings
@@ -25,6 +28,9 @@ class CalibrationSettings:
         Points for the latter two.
     sync : "given" or "estimate"
         Whether the cameras' clocks are to be trusted, frame by frame.
+    box_world : two (3,) float64, optional
+        The lowest and the highest corner of the working volume, metres; by default what the
+        cameras look at.
     """
 
     observe: ObserveSettings = field(default_factory=ObserveSettings)
@@ -32,6 +38,7 @@ class CalibrationSettings:
     world: Literal["board", "points", "floor"] = "board"
     marks: tuple[Mark, ...] = ()
     sync: Literal["given", "estimate"] = "given"
+    box_world: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,6 @@ import io
 import json
 import logging
 import os
-import tempfile
 import threading
 import time
 import zipfile
@@ -36,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.cache import cache_key
+from hybridve.calib.files import appearing
 
 _log = logging.getLogger(__name__)
 
@@ -238,18 +238,12 @@ def _write_members(path: Path, members: dict[str, bytes]) -> bool:
     """Write a zip file whole or not at all; return whether it was written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, partial = tempfile.mkstemp(prefix=f"{path.name}.", dir=path.parent)
-        try:
-            with (
-                os.fdopen(descriptor, "wb") as file,
-                zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-            ):
-                for name, content in members.items():
-                    archive.writestr(name, content)
-            Path(partial).replace(path)
-        except BaseException:
-            Path(partial).unlink(missing_ok=True)
-            raise
+        with (
+            appearing(path, is_contended=True) as partial,
+            zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        ):
+            for name, content in members.items():
+                archive.writestr(name, content)
     except OSError as error:
         _log.info("%s: not kept for the next run: %s", path, error)
         return False

@@ -238,6 +238,42 @@ def view_residuals(bundle: Bundle) -> tuple[NDArray[np.float64], ...]:
     return _by_view(bundle, groups, _residuals(bundle, groups))
 
 
+def total_cost(bundle: Bundle, loss_px: float = np.inf) -> float:
+    """Return the robust sum of squares of all residuals alike; NaN where a seen point is unseen."""
+    residuals = np.concatenate(_residuals(bundle, _groups(bundle)))
+    return float(soft_l1((residuals**2).sum(axis=1), loss_px).sum())
+
+
+def even_information(bundle: Bundle) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what tells how an adjustment errs in which all points count alike.
+
+    Returns
+    -------
+    information : (A, A) float64
+        Its normal matrix without the bodies' poses, for points with a noise of one pixel, in the
+        columns of `make_layout`.
+    spread : (A, A) float64
+        The covariance of its gradient, for points as noisy as their views say
+        (`BundleView.sigma_px`): equal to `information` where they say one pixel. The parameters'
+        covariance is ``inv(information) @ spread @ inv(information)``.
+    """
+    layout = make_layout(bundle)
+
+    def normal(power: int) -> NormalEquations:
+        views = tuple(replace(view, sigma_px=view.sigma_px**power) for view in bundle.views)
+        groups = _groups(replace(bundle, views=views))
+        start = _Projected(bundle, _residuals(bundle, groups))
+        return _Adjustment(layout, groups, np.inf).normal_equations(start)
+
+    even, noisy = normal(0), normal(-1)  # a view counts by the inverse of what it says
+    reduced = even.reduced()
+    information, back = reduced.information, reduced.back
+    crossed = np.einsum("fia,fib->ab", back, noisy.mixed, optimize=True)
+    of_poses = np.einsum("fia,fij,fjb->ab", back, noisy.blocks, back, optimize=True)
+    spread = noisy.shared - crossed - crossed.T + of_poses
+    return information, (spread + spread.T) / 2.0
+
+
 # --- Points, many at once ---------------------------------------------------------------------
 
 

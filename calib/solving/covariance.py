@@ -24,7 +24,15 @@ from hybridve.calib.lens import cam_from_img, img_from_cam, parameter_names
 from hybridve.calib.pose import Pose, transform
 from hybridve.calib.record import Noise
 from hybridve.calib.rig import Rig, RigCovariance
-from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, lens_derivatives
+from hybridve.calib.solving.bundle import (
+    POSE,
+    Adjusted,
+    Bundle,
+    Layout,
+    even_information,
+    lens_derivatives,
+    make_layout,
+)
 
 #: What is smooth over a board: polynomials in its coordinates up to this degree.
 _SMOOTH_DEGREE = 3
@@ -203,18 +211,54 @@ def rig_covariance(adjusted: Adjusted, sigma_px: float) -> RigCovariance:
         theirs (`BundleView.sigma_px`).
     """
     bundle, layout = adjusted.bundle, adjusted.layout
+    if sigma_px > 0:
+        information = adjusted.information / sigma_px**2 + np.diag(_prior(bundle, layout))
+        inverse = _inverted(information)
+    else:
+        inverse = np.zeros_like(adjusted.information)  # points without noise
+    return _of_rig(bundle, layout, inverse)
+
+
+def even_covariance(bundle: Bundle) -> RigCovariance:
+    """Return the covariance that an adjusted rig had, were all its points counted alike.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        Adjusted; its points are as noisy as its views say (`BundleView.sigma_px`), and its held
+        pose is the world. Where they all say the same, it is the rig's own covariance.
+    """
+    layout = make_layout(bundle)
+    information, spread = even_information(bundle)
+    variance = float(np.mean([view.sigma_px**2 for view in bundle.views]))
+    prior = np.diag(_prior(bundle, layout)) * variance
+    inverse = _inverted(information + prior)
+    # As a square, which rounding leaves positive where the pictures tell next to nothing.
+    scale = np.sqrt(np.diag(information + prior))
+    values, vectors = np.linalg.eigh((spread + variance * prior) / np.outer(scale, scale))
+    root = (inverse * scale) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return _of_rig(bundle, layout, root @ root.T)
+
+
+def _prior(bundle: Bundle, layout: Layout) -> NDArray[np.float64]:
+    """Return what is known without a picture: inverse variances (A,) in a layout's columns."""
     prior = np.zeros(layout.size)
     for span in (*layout.of_camera, *layout.of_board.values()):
         prior[span] = [_PRIOR_RAD**-2] * 3 + [_PRIOR_M**-2] * 3
     for camera, lens in zip(bundle.cameras, bundle.lens_of, strict=True):
         if lens in layout.of_lens:
             prior[layout.of_lens[lens]] = _prior_of_lens(camera) ** -2
-    if sigma_px > 0:
-        information = adjusted.information / sigma_px**2 + np.diag(prior)
-        scale = np.sqrt(np.diag(information))
-        inverse = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
-    else:
-        inverse = np.zeros_like(adjusted.information)  # points without noise
+    return prior
+
+
+def _inverted(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverse of a positive definite matrix whose units differ along the diagonal."""
+    scale = np.sqrt(np.diag(information))
+    return np.asarray(np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale))
+
+
+def _of_rig(bundle: Bundle, layout: Layout, inverse: NDArray[np.float64]) -> RigCovariance:
+    """Return the covariance of cameras from that of a layout's columns (A, A)."""
     columns: list[int | None] = []
     labels: list[str] = []
     for index, camera in enumerate(bundle.cameras):

@@ -264,6 +264,10 @@ def locate_board(
 ) -> tuple[Pose, float, float] | None:
     """Return where a flat board lies as one camera sees it.
 
+    COLMAP's robust pose is as exact, but of small or far boards it takes the wrong one of the two
+    poses two to three times as often (noise of 1 px and 0.3 px: 2.0 % for 0.7 %, 11 % for 3.7 % of
+    300 each), and does not tell how well the other one fits.
+
     Parameters
     ----------
     camera : Camera

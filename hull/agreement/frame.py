@@ -66,7 +66,7 @@ from hybridve.hull.query.walk import spans_of_rays
 Kind = Literal["agreed", "nobody", "silent", "within error", "elsewhere", "contradiction", "open"]
 
 #: By how much silhouettes are grown where nobody says otherwise, in pixels: `stated_error_px` of
-#: what `hybridve.hull.contact.uncertainty` assumes of outlines and rigs that tell nothing.
+#: what `hybridve.hull.contact.outline_errors` assumes of outlines and rigs that tell nothing.
 DEFAULT_ERROR_PX = 5
 
 #: So many standard deviations are an error; beyond them is a contradiction.

@@ -93,7 +93,7 @@ class _SceneTable(_Table):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneObject:
-    """One CAD object, placed in the world.
+    """One CAD object, placed in the world; `load_scene` gives arrays that cannot be written to.
 
     Attributes
     ----------
@@ -316,6 +316,8 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             "tessellation_m": cad.tessellation_m,
             "notes": list(cad.notes),
         }
+        for array in (vertices_mesh, vertices_world, part.faces):
+            array.flags.writeable = False  # so that nobody need copy them
         yield SceneObject(
             name=f"{entry.name}.{name}" if is_assembly else entry.name,
             mesh_path=cad.path,

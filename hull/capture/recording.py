@@ -197,13 +197,12 @@ def segmented_frames(
 
 
 def stored_frames(
-    session: Session,
     reader: SilhouetteReader,
     frames: FrameRange,
     *,
     undistortions: list[Undistortion] | None = None,
 ) -> Generator[FrameSilhouettes]:
-    """Yield the silhouettes of a session's frames as they were stored by ``hybridve segment``."""
+    """Yield the silhouettes of frames as they were stored by ``hybridve segment``."""
     stop = reader.n_frames if frames.stop is None else min(frames.stop, reader.n_frames)
     for index in range(frames.start, stop, frames.step):
         started = time.perf_counter()
@@ -253,9 +252,7 @@ def silhouettes_of(
         yield from _placed(cut, tracks)
         return
     with SilhouetteReader(stored) as reader:
-        yield from _placed(
-            stored_frames(session, reader, frames, undistortions=undistortions), tracks
-        )
+        yield from _placed(stored_frames(reader, frames, undistortions=undistortions), tracks)
 
 
 def _placed(

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.calib.calibrate import calibrate_rig
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.rigs import import_rig, read_rig, rig_to_dict
+from hybridve.calib.formats.rig_json import read_rig, rig_to_dict
+from hybridve.calib.formats.rigs import import_rig
 from hybridve.calib.formats.tracker import read_poses
 from hybridve.calib.image_io import FrameSource
 from hybridve.calib.judging.account import Calibration
@@ -31,13 +33,16 @@ from hybridve.hull.capture.session import RigFile, Session
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def calibrate_session(session: Session, progress: Progress | None = None) -> Calibration:
+def calibrate_session(
+    session: Session, progress: Progress | None = None, box_world: Box | None = None
+) -> Calibration:
     """Return a session's rig from its pictures of its boards, and what it was made from.
 
     What was found in the pictures is kept beside the session (rig/corners), so that they are
-    searched once.
+    searched once. `box_world` has two corners of the working volume, metres, if one is asked for.
 
     Raises
     ------
@@ -63,6 +68,7 @@ def calibrate_session(session: Session, progress: Progress | None = None) -> Cal
             for point in session.points
         ),
         sync=session.sync,
+        box_world=box_world,
     )
     tracks = {
         camera.name: read_poses(camera.extrinsics_poses)

@@ -24,8 +24,9 @@ import hybridve.calib
 from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.boards.named import make_board
 from hybridve.calib.errors import CalibrationError, HybridveError
-from hybridve.calib.formats.rigs import rig_to_dict
-from hybridve.calib.judging.check import NotTestableError, check_rig
+from hybridve.calib.formats.rig_json import rig_to_dict
+from hybridve.calib.judging.case import NotTestableError
+from hybridve.calib.judging.check import check_rig
 from hybridve.calib.plain import to_plain
 from hybridve.calib.record import CalibrationRecord
 from hybridve.calib.rig import Rig

@@ -287,7 +287,7 @@ def clean(mask: NDArray[np.uint8], speck_px: int, hole_px: int) -> NDArray[np.ui
 def threshold_mask(image: Image, threshold: int = 127) -> NDArray[np.uint8]:
     """Return 1 where a ready mask, grey or coloured, is brighter than `threshold`."""
     grey = image if image.ndim == 2 else image.max(axis=2)
-    return (grey > threshold).astype(np.uint8)
+    return (grey > threshold).view(np.uint8)
 
 
 def _as_byte(evidence: float) -> int:

@@ -7,6 +7,7 @@ name only when it is complete.
 
 import json
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 
 FORMAT = "hybridve-silhouettes"
 VERSION = 1
@@ -54,13 +56,14 @@ class SilhouetteWriter:
         stamp: str,
     ) -> None:
         self._path = path
-        self._partial = path.with_name(path.name + ".partial")
+        self._files = ExitStack()
         self._sizes_px = sizes_px
         self._reasons: list[str] = []
         try:
-            self._file = h5py.File(self._partial, "w")
+            self._file = h5py.File(self._files.enter_context(appearing(path)), "w")
         except OSError as error:
             raise self._unwritable(error) from error
+        self._files.push(self._finish)
         self._file.attrs["format"] = FORMAT
         self._file.attrs["version"] = VERSION
         for key, text, description in (
@@ -99,7 +102,7 @@ class SilhouetteWriter:
             for number, dataset in enumerate(self._masks):
                 dataset.resize(len(self._reasons) + 1, axis=0)
                 if masks is not None:
-                    dataset[-1] = np.packbits(masks[number] > 0, axis=1)
+                    dataset[-1] = np.packbits(masks[number], axis=1)
         except OSError as error:  # the disk is full
             raise self._unwritable(error) from error
         self._reasons.append("" if masks is not None else reason or "a camera lacks this frame")
@@ -115,16 +118,14 @@ class SilhouetteWriter:
     ) -> None:
         """Complete the file, or remove what there is of it if something went wrong."""
         try:
-            if kind is None:
-                self._complete()
-            else:
-                self._file.close()
+            self._files.__exit__(kind, error, trace)
         except OSError as failure:
             raise self._unwritable(failure) from failure
-        finally:
-            self._partial.unlink(missing_ok=True)
 
-    def _complete(self) -> None:
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            self._file.close()
+            return
         texts = [reason.encode() for reason in self._reasons]
         kind_of_text = h5py.string_dtype("utf-8", max([1, *map(len, texts)]))
         reasons = self._file.create_dataset(
@@ -132,7 +133,6 @@ class SilhouetteWriter:
         )
         _describe(reasons, "why a frame has no silhouettes; empty if it has")
         self._file.close()
-        self._partial.replace(self._path)
 
     def _unwritable(self, error: OSError) -> ReportError:
         return ReportError(f"{self._path}: cannot be written: {_first_line(error)}")

@@ -141,8 +141,7 @@ def _pixels_about(
 ) -> list[tuple[int, int]]:
     """Return object pixels, columns and rows, at and about the projection of a point, in turn."""
     views = hull.views
-    matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    projected = views.project(point_world, camera)
     width, height = views.sizes_px[camera].tolist()
     if not projected[2] > 0:
         return []

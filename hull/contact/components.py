@@ -359,9 +359,8 @@ def _points_within(volumes: Volumes, volume: int) -> NDArray[np.float64]:
 
 def _object_pixels(hull: Hull, camera: int, points_world: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the object pixels (N, 2) that points (P, 3) project to: rows, columns, ascending."""
-    matrix = hull.views.img_from_local[camera]
     mask = hull.mask(camera)
-    h = (points_world - hull.views.origin_world) @ matrix[:, :3].T + matrix[:, 3]
+    h = hull.views.project(points_world, camera)
     h = h[h[:, 2] > 0]
     with np.errstate(over="ignore"):
         pixels = np.clip(h[:, 1::-1] / h[:, 2:], -1, mask.shape)

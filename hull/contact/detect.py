@@ -18,7 +18,12 @@ from hybridve.hull.query.clusters import spatial_order
 from hybridve.hull.query.engine import Engine, Hits, Triangles, checked_vertices
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.query.viewport import place_runs, sample_positions, viewports_for_accuracy
+from hybridve.hull.query.viewport import (
+    place_runs,
+    read_only,
+    sample_positions,
+    viewports_for_accuracy,
+)
 
 #: "colliding": a point of the surface, the witness, is inside every silhouette. "free": proved, no
 #: point of the object is in the hull. "open": nothing as wide as `Contact.open_at_m` is. "": only
@@ -152,7 +157,9 @@ def make_body(
     order = spatial_order(vertices_world, scene_object.faces)
     return Body(
         scene_object.name,
-        Triangles(vertices_world, scene_object.faces[order], viewports[order]),
+        Triangles(
+            vertices_world, read_only(scene_object.faces[order]), read_only(viewports[order])
+        ),
         order.astype(np.uint32),
         lower,
         upper,

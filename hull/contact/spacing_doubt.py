@@ -2,7 +2,7 @@
 
 Let c(s) be the clearance that the hull of one frame keeps from an object moved by s, found from
 silhouettes and cameras that err: too large by more than q in 5 % of recordings
-(`hybridve.hull.contact.uncertainty`: segmentation, undistortion, rounding, and the rig's
+(`hybridve.hull.contact.outline_errors`: segmentation, undistortion, rounding, and the rig's
 covariance; q is 1.645 standard deviations, or more where any of several cameras ends the hull).
 With C the clearance that is required, a frame is *sure to keep it at 95 %* where
 

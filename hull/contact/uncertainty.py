@@ -61,24 +61,18 @@ was not there before) has no standard deviation; the last numbers, of cameras le
 hangs on one silhouette.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
-from itertools import combinations
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from hybridve.calib.pose import Pose
-from hybridve.calib.record import CalibrationRecord
-from hybridve.calib.rig import Rig
-from hybridve.calib.solving.covariance import undistorted_covariance
 from hybridve.hull.contact.bulge import real_upper
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.components import (
-    CELL_M,
     NOWHERE,
     Coverage,
     Volumes,
@@ -88,31 +82,23 @@ from hybridve.hull.contact.components import (
     is_real,
     is_real_at,
 )
+from hybridve.hull.contact.cones import (
+    any_beyond,
+    is_near_background,
+    outline_sensitivity,
+    outline_ways,
+)
 from hybridve.hull.contact.detect import Contact
+from hybridve.hull.contact.outline_errors import DoubtSettings, OutlineErrors
 from hybridve.hull.query.reference import contains_points
-from hybridve.hull.query.silhouettes import BACKGROUND, UNSEEN, Hull, Views, hull_of
-from hybridve.hull.query.walk import silhouette_normal
+from hybridve.hull.query.silhouettes import Hull, Views, hull_of
 
 #: One-sided 95 % of a normal distribution, in standard deviations.
 ONE_SIDED_95 = 1.645
 
-#: A camera ends the hull at a point if background lies this near to the point's projection. The
-#: nearest point is a corner of the hull's pixel stairs, up to 1.4 pixels beside each outline.
-_NEAR_PX = 1.5
-
 #: Non-negative combinations of the cones' normals that are farther than this from the direction to
 #: the object (a unit vector) explain it badly: about 20 degrees.
 _MOST_RESIDUAL = 0.35
-
-#: Sets of cones end the hull where the combination of their normals is by no more than this farther
-#: from the direction than the best (about 11 degrees). An outline that errs by e moves the nearest
-#: point of a thing of radius r sideways, to where its normal is turned by sqrt(2 e / r) radians:
-#: 0.2 for a millimetre and a forearm of 5 cm. Less would leave out cameras that end the hull just
-#: as well; more would count some that do not, and ask for more room than need be.
-_AS_GOOD = 0.2
-
-#: Draws from which the 95 % of several sets of cones together are found, to about 2 %.
-_DRAWS = 1 << 14
 
 #: Nearer than this there is no direction from the hull to the object.
 _NO_DIRECTION_M = 1e-7
@@ -123,157 +109,8 @@ _NEAR_REQUIRED = 2.0
 #: Collision points that are asked whether they stand without a camera.
 _MOST_POINTS = 4096
 
-
 #: So many of a contact's points are asked for a proof that it is real before volumes are made.
 _QUICK_POINTS = 4
-
-
-@dataclass(frozen=True, slots=True)
-class DoubtSettings:
-    """What is assumed of silhouettes and cameras that tell nothing themselves.
-
-    Attributes
-    ----------
-    segmentation_px : float
-        Standard deviation of an outline about the true one. On the horseman recording our
-        outlines are 1.4 to 2.1 px (by camera) off those painted by hand, where they are less than
-        8 px off; hands have erred by about a pixel themselves.
-    calibration_px : float
-        Standard deviation of a projection along one axis, for cameras whose rig does not tell.
-    cell_m : float
-        Volumes that are nearer to each other than some two of these may be told as one.
-    near_m : float
-        Objects that are farther from the hull than this, and than twice the clearance that they
-        require, have no `real_upper_m`, `survives` and `component`: that takes most of the time.
-    """
-
-    segmentation_px: float = 1.5
-    calibration_px: float = 0.5
-    cell_m: float = CELL_M
-    near_m: float = 0.10
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OutlineErrors:
-    """Standard deviations of where each camera's outline is, across the outline, in pixels.
-
-    Attributes
-    ----------
-    calibration_px : (C,) float64
-        Of a projection along one axis.
-    is_measured : (C,) bool
-        Whether that comes from the rig; else it is assumed.
-    segmentation_px : float
-        Of the outline in the image.
-    lens_px : (C,) float64
-        Of undistorting the silhouette, whose shift is bounded: even within that bound.
-    rig : Rig or None
-        The cameras' rig, if it knows its covariance; `calibration_px` is not used then.
-    """
-
-    calibration_px: NDArray[np.float64]
-    is_measured: NDArray[np.bool_]
-    segmentation_px: float
-    lens_px: NDArray[np.float64]
-    rig: Rig | None = None
-
-    #: Of an outline that is rounded to whole pixels: even within half a pixel.
-    quantisation_px = 1.0 / np.sqrt(12.0)
-
-    @property
-    def sigma_px(self) -> NDArray[np.float64]:
-        """All of it together, but the rig's covariance: (C,)."""
-        variance = self.lens_px**2 + self.segmentation_px**2 + self.quantisation_px**2
-        if self.rig is None:
-            variance = variance + self.calibration_px**2
-        return np.asarray(np.sqrt(variance))
-
-    def calibration_variance_m2(
-        self,
-        point_world: NDArray[np.float64],
-        m_per_px: NDArray[np.float64],
-        normals_px: NDArray[np.float64],
-    ) -> float:
-        """Return the variance that the rig's covariance gives a clearance; 0 without one.
-
-        Parameters
-        ----------
-        point_world : (3,) float64
-            The hull's nearest point, metres.
-        m_per_px : (C,) float64
-            How far the clearance falls as each camera's outline moves outward by a pixel.
-        normals_px : (C, 2) float64
-            The outlines' outward normals in the images, unit vectors; NaN where not known: the
-            error is taken to be that along either axis, independent of other cameras.
-        """
-        if self.rig is None or not m_per_px.any():
-            return 0.0
-        covariance = self.calibration_covariance_px2(point_world, normals_px)
-        return max(0.0, float(m_per_px @ covariance @ m_per_px))
-
-    def calibration_covariance_px2(
-        self, point_world: NDArray[np.float64], normals_px: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return what the rig's covariance makes of outlines, along their normals: (C, C), px^2.
-
-        Parameters are those of `calibration_variance_m2`. It is zero without a covariance.
-        """
-        n_cameras = len(normals_px)
-        if self.rig is None:
-            return np.zeros((n_cameras, n_cameras))
-        covariance = np.nan_to_num(undistorted_covariance(self.rig, point_world))
-        is_known = np.asarray(np.isfinite(normals_px).all(axis=1))
-        normals = np.where(is_known[:, None], normals_px, 0.0)
-        along_px2 = np.asarray(np.einsum("ki,kilj,lj->kl", normals, covariance, normals))
-        for camera in np.flatnonzero(~is_known):
-            along_px2[camera, camera] = np.trace(covariance[camera, :, camera]) / 2.0
-        return along_px2
-
-
-def outline_errors(
-    names: Sequence[str],
-    rig: Rig | None,
-    mask_shift_px: Sequence[float | None],
-    settings: DoubtSettings | None = None,
-) -> OutlineErrors:
-    """Return how far outlines may be off, as far as the rig tells.
-
-    Parameters
-    ----------
-    names : sequence of str
-        The cameras, C of them.
-    rig : Rig or None
-        The rig. Its covariance is used if it has one; else how far the corners of the board were
-        missed, when it was calibrated or by the session's test of it, whichever is more. These are
-        lengths, and an outline cares for one axis only. None: nothing is told.
-    mask_shift_px : sequence of C floats or None
-        Bounds of `hybridve.calib.lens_bound`; None where there is none, which counts as a pixel.
-    settings : DoubtSettings, optional
-        What is assumed where the rig does not tell.
-    """
-    settings = settings or DoubtSettings()
-    missed_px = np.array([_missed_px(rig, name) for name in names])
-    is_measured = np.isfinite(missed_px)
-    shift_px = np.array([1.0 if shift is None else shift for shift in mask_shift_px], np.float64)
-    return OutlineErrors(
-        np.where(is_measured, missed_px / np.sqrt(2.0), settings.calibration_px),
-        is_measured,
-        settings.segmentation_px,
-        shift_px / np.sqrt(3.0),
-        rig.only(names) if rig is not None and rig.covariance is not None else None,
-    )
-
-
-def _missed_px(rig: Rig | None, name: str) -> float:
-    """Return the rms length by which a camera's corners were missed; NaN where nobody knows."""
-    told: list[float | None] = []
-    if rig is not None and isinstance(rig.provenance, CalibrationRecord):
-        camera = rig.provenance.cameras.get(name)
-        if camera is not None:
-            told += [camera.intrinsics.rms_px, camera.extrinsics.rms_px]
-    if rig is not None and rig.check is not None and rig.check.check is not None:
-        told.append(rig.check.check.rms_px.get(name))
-    return max((missed_px for missed_px in told if missed_px is not None), default=np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -503,7 +340,7 @@ class FrameDoubts:
                 covariance_px2 += errors.calibration_covariance_px2(
                     clearance.on_hull_world, normals_px
                 )
-                too_large_m = max(too_large_m, _any_beyond(ways_m, covariance_px2))
+                too_large_m = max(too_large_m, any_beyond(ways_m, covariance_px2))
         return Deviation(std_m, too_large_m, m_per_px, is_remeasured)
 
     def sensitivity(
@@ -535,7 +372,7 @@ class FrameDoubts:
         if residual <= _MOST_RESIDUAL:
             return sensitivity_m, False, normals_px
         for camera in range(n_cameras):
-            if _is_near_background(self.hull, camera, clearance.on_hull_world):
+            if is_near_background(self.hull, camera, clearance.on_hull_world):
                 then = meter.measure(self._grown_in(camera), shift_world)
                 sensitivity_m[camera] = max(0.0, clearance.signed_m[1] - then.signed_m[1])
         return sensitivity_m, True, unknown
@@ -611,15 +448,14 @@ def _touching_points(contact: Contact) -> NDArray[np.float64]:
 
 def _count_seeing(views: Views, point_world: NDArray[np.float64]) -> int:
     """Return how many cameras see a point."""
-    projected = views.img_from_local @ np.append(point_world - views.origin_world, 1.0)  # (C, 3)
-    depth_m = projected[:, 2:]
-    seen = (depth_m > 0) & (projected[:, :2] >= 0) & (projected[:, :2] < views.sizes_px * depth_m)
     n_seeing = 0
-    for camera in np.flatnonzero(seen.all(axis=1)):
-        recorded = views.seen_mask(int(camera))
-        pixel = (projected[camera, :2] / depth_m[camera]).astype(np.int64)
-        column, row = np.minimum(pixel, views.sizes_px[camera] - 1)  # division may round up
-        n_seeing += recorded is None or bool(recorded[row, column])
+    for camera, (width, height) in enumerate(views.sizes_px.tolist()):
+        x, y, depth_m = views.project(point_world, camera).tolist()
+        if not (depth_m > 0 and 0 <= x < width * depth_m and 0 <= y < height * depth_m):
+            continue
+        recorded = views.seen_mask(camera)
+        column, row = min(int(x / depth_m), width - 1), min(int(y / depth_m), height - 1)
+        n_seeing += recorded is None or bool(recorded[row, column])  # division may round up
     return n_seeing
 
 
@@ -654,193 +490,3 @@ def _direction(clearance: Clearance) -> NDArray[np.float64]:
     if not distance_m > _NO_DIRECTION_M:  # or NaN
         return np.full(3, np.nan)
     return np.asarray(toward / (-distance_m if _is_inside(clearance) else distance_m))
-
-
-def outline_sensitivity(
-    hull: Hull, point_world: NDArray[np.float64], direction: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """Return how far the hull's extreme point moves as outlines do, and how well that is explained.
-
-    Parameters
-    ----------
-    hull : Hull
-        The hull of one frame.
-    point_world : (3,) float64
-        The point of the hull that lies farthest along the direction, metres.
-    direction : (3,) float64
-        Unit vector in the world's frame.
-
-    Returns
-    -------
-    m_per_px : (C,) float64
-        By how many metres the hull reaches farther when a camera's outline moves outward by a
-        pixel: ``lambda_k s_k`` of this file's head.
-    residual : float
-        How far the combination of normals is from the direction; 1 where no camera ends the hull.
-    normals_px : (C, 2) float64
-        The outlines' outward normals in the images, unit vectors; NaN where a camera does not end
-        the hull there.
-    """
-    cones = _cones_at(hull, point_world)
-    m_per_px = np.zeros(len(hull.views))
-    if len(cones.cameras) == 0:
-        return m_per_px, 1.0, cones.normals_px
-    multipliers, residual = nnls(cones.normals_world.T, direction)
-    m_per_px[cones.cameras] = multipliers * cones.m_per_px
-    return m_per_px, float(residual), cones.normals_px
-
-
-def outline_ways(
-    hull: Hull, point_world: NDArray[np.float64], direction: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return in which ways the hull's extreme point is held: each set of cones that ends it there.
-
-    Parameters are those of `outline_sensitivity`.
-
-    Returns
-    -------
-    ways_m : (V, C) float64
-        For each set the metres per pixel of its cameras, 0 for the others. With errors e (C,) of
-        the outlines in pixels the hull reaches farther by the smallest of ``ways_m @ e``.
-    normals_px : (C, 2) float64
-        As of `outline_sensitivity`.
-    """
-    cones = _cones_at(hull, point_world)
-    found, residuals = [], []
-    for size in (1, 2, 3):  # three cones hold a point whatever the direction; more are no vertex
-        for chosen in combinations(range(len(cones.cameras)), size):
-            which = list(chosen)
-            multipliers, residual = nnls(cones.normals_world[which].T, direction)
-            if (multipliers > 0).all():
-                way = np.zeros(len(hull.views))
-                way[cones.cameras[which]] = multipliers * cones.m_per_px[which]
-                found.append(way)
-                residuals.append(float(residual))
-    as_good = min([*residuals, np.inf]) + _AS_GOOD
-    ways = [way for way, residual in zip(found, residuals, strict=True) if residual <= as_good]
-    return np.array(ways).reshape(-1, len(hull.views)), cones.normals_px
-
-
-def _any_beyond(ways_m: NDArray[np.float64], covariance_px2: NDArray[np.float64]) -> float:
-    """Return what the largest of ``ways_m @ e`` exceeds in 5 % of the cases, metres.
-
-    e (C,) is normal with mean 0.
-    """
-    matters = ways_m.any(axis=0)  # what other cameras do changes nothing, not even the draws
-    ways_m, covariance_px2 = ways_m[:, matters], covariance_px2[np.ix_(matters, matters)]
-    spread, axes = np.linalg.eigh(covariance_px2)
-    across_m = ways_m @ (axes * np.sqrt(np.maximum(spread, 0.0)))  # (V, C)
-    return float(np.quantile((_draws(len(spread)) @ across_m.T).max(axis=1), 0.95))
-
-
-@lru_cache(maxsize=4)
-def _draws(n_numbers: int) -> NDArray[np.float64]:
-    """Return independent standard normal numbers (N, n), always the same."""
-    return np.random.default_rng(0).normal(size=(_DRAWS, n_numbers))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cones:
-    """The K cones, of C, that end the hull at a point, or nearly.
-
-    Attributes
-    ----------
-    cameras : (K,) int64
-        Whose they are.
-    normals_world : (K, 3) float64
-        Their outward normals.
-    m_per_px : (K,) float64
-        How far each moves along it as its outline moves by a pixel.
-    normals_px : (C, 2) float64
-        The outlines' outward normals in the images; NaN for all other cameras.
-    """
-
-    cameras: NDArray[np.int64]
-    normals_world: NDArray[np.float64]
-    m_per_px: NDArray[np.float64]
-    normals_px: NDArray[np.float64]
-
-
-def _cones_at(hull: Hull, point_world: NDArray[np.float64]) -> _Cones:
-    views = hull.views
-    normals_px = np.full((len(views), 2), np.nan)
-    cameras, normals, moves_m = [], [], []
-    for camera in range(len(views)):
-        if _is_near_background(hull, camera, point_world):
-            normal = silhouette_normal(hull, camera, point_world)
-            if np.isfinite(normal).all():
-                metres, normals_px[camera] = metres_per_pixel(views, camera, point_world, normal)
-                cameras.append(camera)
-                normals.append(normal)
-                moves_m.append(metres)
-    return _Cones(
-        np.array(cameras, np.int64),
-        np.array(normals).reshape(-1, 3),
-        np.array(moves_m),
-        normals_px,
-    )
-
-
-def metres_per_pixel(
-    views: Views, camera: int, point_world: NDArray[np.float64], normal: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
-    """Return how far a silhouette cone moves as its outline moves by a pixel, and that way.
-
-    Parameters
-    ----------
-    views : Views
-        The cameras.
-    camera : int
-        The one whose outline moves.
-    point_world : (3,) float64
-        A point on its cone, in front of it, metres.
-    normal : (3,) float64
-        The cone's normal there: a unit vector across the ray.
-
-    Returns
-    -------
-    metres : float
-        Along the normal.
-    normal_px : (2,) float64
-        The outline's normal in the image, a unit vector.
-    """
-    matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
-    pixel = projected[:2] / projected[2]
-    derivatives = (matrix[:2, :3] - pixel[:, None] * matrix[2, :3]) / projected[2]  # (2, 3)
-    line, *_ = np.linalg.lstsq(derivatives.T, normal, rcond=None)
-    metres = float(np.linalg.norm(line))
-    return metres, np.asarray(line / metres if metres > 0 else np.full(2, np.nan))
-
-
-def _is_near_background(hull: Hull, camera: int, point_world: NDArray[np.float64]) -> bool:
-    """Tell whether a camera sees background within `_NEAR_PX` of a point that it sees."""
-    views = hull.views
-    matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
-    if not projected[2] > 0:
-        return False
-    x, y = projected[:2] / projected[2]
-    answers = hull.answers(camera)
-    height, width = answers.shape
-    if not (0 <= x < width and 0 <= y < height):
-        return False
-    most = int(_NEAR_PX) + 1
-    column, row = int(x), int(y)
-    if answers[row, column] == UNSEEN:
-        return False
-    if most <= column < width - most and most <= row < height - most:
-        around = answers[row - most : row + most + 1, column - most : column + most + 1]
-        if around.all():  # most often
-            return False
-    reach = np.arange(-most, most + 1)
-    columns, rows = column + reach, row + reach
-    # To the nearest point of each pixel's square.
-    away_x = np.maximum(np.maximum(columns - x, x - columns - 1), 0.0)
-    away_y = np.maximum(np.maximum(rows - y, y - rows - 1), 0.0)
-    is_near = away_x**2 + away_y[:, None] ** 2 <= _NEAR_PX**2
-    is_within = (columns >= 0) & (columns < width) & ((rows >= 0) & (rows < height))[:, None]
-    value = answers[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)]
-    beyond_ends = views.unseen == "carve"
-    is_background = np.where(is_within, value == BACKGROUND, beyond_ends)
-    return bool((is_near & is_background).any())

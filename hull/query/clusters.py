@@ -7,8 +7,6 @@ Nothing in it depends on the silhouettes: it serves as long as mesh and cameras 
 """
 
 import itertools
-import weakref
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +20,7 @@ from hybridve.hull.query.rectangles import (
     BATCH,
     BRANCH,
     CLUSTER,
+    PreparedMesh,
     Surface,
     Tree,
     cluster_rectangles,
@@ -108,20 +107,6 @@ class Share(NamedTuple):
     surface: Surface
 
 
-@dataclass(slots=True, eq=False)
-class _Prepared:
-    """What is derived from a mesh as long as it and the cameras stay the same."""
-
-    views: Views
-    surface: Surface
-    tree: Tree | None
-    first_hull: Hull | None  # that was asked about it; None once there is a tree
-
-
-#: Kept as long as the mesh lives.
-_prepared: weakref.WeakKeyDictionary[Triangles, _Prepared] = weakref.WeakKeyDictionary()
-
-
 def make_shares(
     hull: Hull, frame: Frame, mesh: Triangles, threads: Threads, *, reject: bool = True
 ) -> list[Share]:
@@ -143,12 +128,13 @@ def make_shares(
     """
     if len(mesh) == 0:
         return []
-    prepared = _prepared.get(mesh)
+    prepared = mesh.prepared
     if prepared is None or prepared.views is not hull.views:
         vertices_local, reach_m = _localized(mesh.vertices_world, hull.views.origin_world)
         pads = rectangle_pads(hull.views, reach_m, ROUNDOFF_FLOAT64)
-        prepared = _Prepared(hull.views, Surface(vertices_local, mesh.faces, pads), None, hull)
-        _prepared[mesh] = prepared
+        surface = Surface(vertices_local, mesh.faces, pads)
+        prepared = PreparedMesh(hull.views, surface, None, hull)
+        mesh.hold(prepared)
     is_static = prepared.first_hull is not hull
     if prepared.tree is None and is_static and reject and len(mesh) >= _TREE_TRIANGLES:
         prepared.tree = _make_tree(prepared.views, prepared.surface, threads)

@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.query.rectangles import PreparedMesh
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import (
     MAX_VIEWPORT,
@@ -72,6 +73,8 @@ class Triangles:
         Samples along an edge of each triangle; see `hybridve.hull.query.viewport`.
     topology : Topology
         The last two and what follows from them; one object for all that `moved` returns.
+    prepared : PreparedMesh or None
+        What was derived from it for the cameras that asked last; see `hold`.
 
     Raises
     ------
@@ -84,6 +87,7 @@ class Triangles:
     faces: NDArray[np.int32]
     viewports: NDArray[np.int32]
     topology: Topology = field(init=False)
+    prepared: PreparedMesh | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         vertices_world = checked_vertices(self.vertices_world)
@@ -129,7 +133,12 @@ class Triangles:
         object.__setattr__(moved, "vertices_world", checked_vertices(vertices_world))
         for name in ("faces", "viewports", "topology"):
             object.__setattr__(moved, name, getattr(self, name))
+        moved.hold(None)
         return moved
+
+    def hold(self, prepared: PreparedMesh | None) -> None:
+        """Keep what was derived from this mesh, in place of what was kept before."""
+        object.__setattr__(self, "prepared", prepared)
 
     def __len__(self) -> int:
         return len(self.faces)

@@ -10,6 +10,7 @@ Named tuples carry what many loops need. Reading an array from one counts a refe
 nanoseconds: the innermost functions take the arrays themselves.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from hybridve.hull.query.boxes import (
     rectangle_vote,
 )
 from hybridve.hull.query.frame import Frame
+from hybridve.hull.query.silhouettes import Hull, Views
 
 #: Triangles whose rectangles are computed together: their corners stay in the first cache.
 BATCH = 256
@@ -65,6 +67,30 @@ class Tree(NamedTuple):
 
     rectangles: NDArray[np.int32]
     level_start: NDArray[np.int64]
+
+
+@dataclass(slots=True, eq=False)
+class PreparedMesh:
+    """What is derived from a mesh as long as it and the cameras stay the same.
+
+    The mesh holds it (`hybridve.hull.query.engine.Triangles`), so that all who ask share it.
+
+    Attributes
+    ----------
+    views : Views
+        The cameras.
+    surface : Surface
+        The mesh about their local origin; pads in the order of the views.
+    tree : Tree or None
+        Its clusters; made when a second frame asks.
+    first_hull : Hull or None
+        The hull that was asked about it first; None once there is a tree.
+    """
+
+    views: Views
+    surface: Surface
+    tree: Tree | None
+    first_hull: Hull | None
 
 
 @compiled

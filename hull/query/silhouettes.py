@@ -116,9 +116,10 @@ def make_seen(
                 f"what camera {names[camera]} saw has shape {mask.shape}, "
                 f"expected {(height, width)}"
             )
-        if (mask != 0).all():
+        is_seen = mask != 0
+        if is_seen.all():
             continue
-        seen = np.asarray(mask != 0).view(np.uint8)
+        seen = is_seen.view(np.uint8)
         mask_offset[camera] = sum(map(len, flat))
         integral_offset[camera] = sum(map(len, integrals))
         flat.append(seen.ravel())
@@ -165,6 +166,16 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def project(self, points_world: NDArray[np.float64], camera: int) -> NDArray[np.float64]:
+        """Return the homogeneous pixels (..., 3) of points (..., 3), metres, in one camera.
+
+        The third coordinate is the depth in metres; divided by it, the others are a pixel where
+        it is above 0.
+        """
+        matrix = self.img_from_local[camera]
+        projected = (points_world - self.origin_world) @ matrix[:, :3].T + matrix[:, 3]
+        return np.asarray(projected, np.float64)
 
     def centers_local(self) -> NDArray[np.float64]:
         """Return where the cameras stand, (C, 3) metres."""
@@ -472,7 +483,9 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
                 answers[:] = target
             else:
                 np.bitwise_and(target, seen, out=target)
-                np.add(target, np.uint8(UNSEEN) * (np.uint8(1) - seen), out=answers)
+                np.subtract(np.uint8(1), seen, out=answers)
+                np.multiply(answers, np.uint8(UNSEEN), out=answers)
+                np.add(answers, target, out=answers)
         cv2.integral(target, sum=hull.integral(camera), sdepth=cv2.CV_32S)
     for images in (hull.masks_flat, hull.answers_flat, hull.integrals_flat):
         images.flags.writeable = False

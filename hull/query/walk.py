@@ -21,10 +21,11 @@ from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT, UNSEEN, Hull, Views
 
 #: Stretches and gaps shorter than `least_stretches` are not told: rounding makes them where a ray
-#: crosses a column and a row at once. As shares of how far cameras and ray lie apart, where
-#: crossings are off by some 2^-52: 1e-12 m in a room; and of how far the world's origin is, where
-#: numbers are coarser: 1e-10 m at 10 km.
-_LEAST_OF_ROOM, _LEAST_OF_WORLD = 2.0**-42, 2.0**-46
+#: crosses a column and a row at once. Crossings are off by some 2^-52 of how far cameras and ray
+#: lie apart, and of how far the world's origin is, times how much more slowly than across its view
+#: the ray crosses the camera's pixels. As shares of these two: for rays that pass the camera at a
+#: millionth of the first, 1e-9 m in a room; and at a thousandth, 2e-9 m at 10 km.
+_LEAST_OF_ROOM, _LEAST_OF_WORLD = 2.0**-32, 2.0**-42
 
 #: How far `boundary_cameras` looks to either side of a boundary point, as a share of how far the
 #: cameras are from it: 1e-9 m in a room.
@@ -139,7 +140,7 @@ def spans_of_rays(
 def least_stretches(views: Views, origins_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how long the shortest stretches and gaps are that are told of some rays, (R,) metres.
 
-    Rays that begin at (R, 3) metres, world. In a room it is 1e-12 m; in larger and smaller ones as
+    Rays that begin at (R, 3) metres, world. In a room it is 1e-9 m; in larger and smaller ones as
     much larger and smaller, and far from the world's origin what rounding leaves there.
     """
     room_m, world_m = _sizes(views, origins_world)
@@ -250,7 +251,7 @@ def silhouette_normal(
     nowhere = np.full(3, np.nan)
     views = hull.views
     matrix = views.img_from_local[camera]
-    projected = matrix[:, :3] @ (point_world - views.origin_world) + matrix[:, 3]
+    projected = views.project(point_world, camera)
     width, height = views.sizes_px[camera].tolist()
     if not projected[2] > 0:
         return nowhere

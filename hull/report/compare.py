@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 
 #: Between a session and a layout in the name of their report; names themselves never hold it.
 _BETWEEN = "__"
@@ -183,12 +184,10 @@ def write_comparison(path: Path, comparison: dict[str, Any]) -> None:
             cells = [_csv_value(row["sessions"].get(name), quantity) for name in sessions]
             about = [row["layout"], row["object"], quantity.key, quantity.unit, quantity.kind]
             writer.writerow([*about, *cells])
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_text(text.getvalue(), encoding="utf-8")
-        partial.replace(path)
+        with appearing(path) as partial:
+            partial.write_text(text.getvalue(), encoding="utf-8")
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise ReportError(f"{path}: cannot be written: {error.strerror}") from error
 
 

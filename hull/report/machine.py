@@ -1,9 +1,12 @@
-"""The machine and the software that made a result, as a report remembers them."""
+"""The run, the machine and the software that made a result, as its file remembers them."""
 
 import os
 import platform
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Self
 
 #: The packages whose versions decide a result.
 PACKAGES = (
@@ -47,3 +50,35 @@ def machine_text() -> str:
                 processor = line.split(":", 1)[1].strip()
                 break
     return f"{platform.system()} {platform.release()}, {processor}, {n_threads()} processors"
+
+
+def utc_now() -> str:
+    """Return the time as files give it."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Which run made a result.
+
+    Attributes
+    ----------
+    command : str
+        The command line.
+    machine : str
+        The machine in words.
+    versions : dict
+        Versions of the software that took part.
+    created_utc : str
+        When the result was there.
+    """
+
+    command: str
+    machine: str
+    versions: dict[str, str]
+    created_utc: str
+
+    @classmethod
+    def now(cls, command: str) -> Self:
+        """Return the run of a command on this machine, now."""
+        return cls(command, machine_text(), software_versions(), utc_now())

@@ -1,12 +1,18 @@
 """HDF5 files with one result each: complete or absent, of a known format and version."""
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import h5py
+from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
+from hybridve.hull.report.machine import Run
 
 #: How every dataset of a result is stored.
 STORED = {
@@ -16,6 +22,78 @@ STORED = {
     "fletcher32": True,
     "track_times": False,
 }
+
+#: How far a number can be trusted. "exact": what it says, to floating-point accuracy. "bound": the
+#: truth is on one side of it, or between two. "estimate": near the truth, by a model of errors or
+#: a guess at what was not seen. "sampled": of the samples alone; what lies between them is missed.
+Kind = Literal["exact", "bound", "estimate", "sampled"]
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """What a dataset says of itself.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the file, below its group.
+    unit : str
+        "1" where it has none.
+    kind : Kind
+        How far it can be trusted.
+    description : str
+        What it says, for whoever opens the file.
+    """
+
+    name: str
+    unit: str
+    kind: Kind
+    description: str
+
+    def describe(self, dataset: h5py.Dataset) -> None:
+        """Write it to a dataset."""
+        dataset.attrs["unit"] = self.unit
+        dataset.attrs["kind"] = self.kind
+        dataset.attrs["description"] = self.description
+
+
+def store(group: h5py.Group, column: Described, values: NDArray[Any]) -> h5py.Dataset:
+    """Store an array in a group, and return its dataset."""
+    dataset = group.create_dataset(column.name, data=values, chunks=True, **STORED)
+    column.describe(dataset)
+    return dataset
+
+
+def store_fields(group: h5py.Group, value: object, columns: Sequence[Described]) -> None:
+    """Store those fields of a value that columns name."""
+    for column in columns:
+        store(group, column, getattr(value, column.name))
+
+
+def store_text(group: h5py.Group, name: str, text: str | list[str], description: str) -> None:
+    """Store one text, or several."""
+    dataset = group.create_dataset(name, data=text, dtype=h5py.string_dtype(), track_times=False)
+    Described(name, "1", "exact", description).describe(dataset)
+
+
+def write_run(file: h5py.File, what: str, version: int, run: Run) -> None:
+    """Write that a file is of the format ``hybridve-WHAT``, of which version, and of which run."""
+    file.attrs["format"] = f"hybridve-{what}"
+    file.attrs["version"] = version
+    file.attrs["created_utc"] = run.created_utc
+    file.attrs["command"] = run.command
+    file.attrs["machine"] = run.machine
+    file.attrs["versions"] = json.dumps(run.versions)
+
+
+def read_run(file: h5py.File) -> Run:
+    """Return which run made a file."""
+    return Run(
+        command=file.attrs["command"],
+        machine=file.attrs["machine"],
+        versions=json.loads(file.attrs["versions"]),
+        created_utc=file.attrs["created_utc"],
+    )
 
 
 @contextmanager
@@ -27,15 +105,11 @@ def writing(path: Path) -> Iterator[h5py.File]:
     ReportError
         If it cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
     try:
-        with h5py.File(partial, "w") as file:
+        with appearing(path) as partial, h5py.File(partial, "w") as file:
             yield file
-        partial.replace(path)
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -6,13 +6,15 @@ a new number in a report is one more line in one of them.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.report.collisions import Runs, StoredMesh
+from hybridve.hull.report.machine import Run
+from hybridve.hull.report.result_file import Described
 
 if TYPE_CHECKING:  # whoever only reads a report waits for none of these
     from hybridve.hull.contact.backtrack import FirstContact
@@ -24,7 +26,6 @@ if TYPE_CHECKING:  # whoever only reads a report waits for none of these
     from hybridve.hull.contact.respond import Response
     from hybridve.hull.contact.uncertainty import Doubt
 
-FORMAT = "hybridve-report"
 VERSION = 2
 
 #: Versions that are read.
@@ -43,11 +44,6 @@ STAGES = (
     "doubt",
     "write",
 )
-
-#: How far a number can be trusted. "exact": what it says, to floating-point accuracy. "bound": the
-#: truth is on one side of it, or between two. "estimate": near the truth, by a model of errors or
-#: a guess at what was not seen. "sampled": of the samples alone; what lies between them is missed.
-Kind = Literal["exact", "bound", "estimate", "sampled"]
 
 #: What an evaluation may compute of an object.
 Part = Literal["contact", "clearance", "first contact", "response", "recovery", "doubt"]
@@ -123,8 +119,8 @@ class ReportHeader:
 
     Attributes
     ----------
-    command : str
-        The command line.
+    run : Run
+        Which run made it; when it was there is said when it is.
     objects : tuple of dict
         Per object ``name`` and what else is worth keeping, as plain JSON values; None is left out.
     settings : dict
@@ -138,10 +134,6 @@ class ReportHeader:
         What was computed of each object besides its contact.
     cameras : tuple of str
         The cameras, C of them, in the order of columns that have a number for each.
-    versions : dict
-        Versions of the software that took part.
-    machine : str
-        The machine in words.
     local_origin_m : tuple of 3 floats
         Places in the file are metres about this point of the world.
     meshes : tuple of StoredMesh
@@ -150,7 +142,7 @@ class ReportHeader:
         Whether all collision points are spelt out, or only a sample of them for pictures.
     """
 
-    command: str
+    run: Run
     objects: tuple[dict[str, Any], ...]
     settings: dict[str, Any]
     rig: dict[str, Any]
@@ -158,8 +150,6 @@ class ReportHeader:
     renderer: str
     parts: frozenset[Part] = frozenset()
     cameras: tuple[str, ...] = ()
-    versions: dict[str, str] = field(default_factory=dict)
-    machine: str = ""
     local_origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     meshes: tuple[StoredMesh, ...] = ()
     points: Literal["sample", "all"] = "sample"
@@ -169,19 +159,11 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Column(Generic[T]):
+class Column(Described, Generic[T]):
     """One dataset of the report.
 
     Attributes
     ----------
-    name : str
-        Its name in the file, below the group of the frames or of the object.
-    unit : str
-        "1" where it has none.
-    kind : Kind
-        How far it can be trusted.
-    description : str
-        What it says, for whoever opens the file.
     dtype : type
         NumPy's; `str` for texts.
     take : callable
@@ -195,10 +177,6 @@ class Column(Generic[T]):
         Its value in a frame that was not evaluated, of that frame; else `fill`.
     """
 
-    name: str
-    unit: str
-    kind: Kind
-    description: str
     dtype: type
     take: Callable[[T], Any]
     shape: tuple[int | Literal["C"], ...] = ()
@@ -310,7 +288,7 @@ _VERDICT: "tuple[Column[Finding], ...]" = (
         "there; kept: proved to keep its distance",
         str,
         lambda finding: finding.verdict,
-        absent=lambda result: "unknown",
+        absent=lambda _: "unknown",
     ),
     Column(
         "reason",

@@ -26,10 +26,19 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.report.result_file import STORED, reading, writing
-from hybridve.hull.report.schema import Kind
+from hybridve.hull.report.machine import Run
+from hybridve.hull.report.result_file import (
+    Described,
+    Kind,
+    read_run,
+    reading,
+    store,
+    store_fields,
+    store_text,
+    write_run,
+    writing,
+)
 
-FORMAT = "hybridve-spacing"
 VERSION = 1
 
 
@@ -220,20 +229,38 @@ class Spacing:
 
     Attributes
     ----------
-    command, machine, created_utc : str
-        As in a report.
-    versions, settings : dict
-        As in a report; the settings say what was moved, whereto and how far.
+    run : Run
+        Which run made it.
+    settings : dict
+        As in a report; they say what was moved, whereto and how far.
     sessions : tuple of SessionSpacing
         At least one.
     """
 
-    command: str
-    machine: str
-    created_utc: str
-    versions: dict[str, str]
+    run: Run
     settings: dict[str, Any]
     sessions: tuple[SessionSpacing, ...]
+
+
+_FREE = Described("free", "m", "bound", "shifts proved to keep every clearance")
+_CURVE_COLUMNS = (
+    Described("shift_m", "m", "exact", "how far the objects are moved"),
+    Described("violated", "1", "bound", "frames that surely violate a clearance"),
+    Described("undecided", "1", "bound", "frames of which that is not known"),
+)
+_FRAME_COLUMNS = (
+    Described("index", "1", "exact", "number of the frame in the session"),
+    Described("time_s", "s", "exact", "time since the recording began"),
+    Described("n_measured", "1", "exact", "measurements of an object in a place"),
+    Described("measure_s", "s", "exact", "how long they took"),
+)
+_OFFSET = Described("offset", "1", "exact", "where the rows of each frame begin")
+_STD_BY_FRAME = Described(
+    "std_by_frame_m",
+    "m",
+    "estimate",
+    "standard deviation of the clearance, the largest of the objects moved",
+)
 
 
 def write_spacing(path: Path, spacing: Spacing) -> None:
@@ -261,13 +288,8 @@ def read_spacing(path: Path) -> Spacing:
 
 
 def _write(file: h5py.File, spacing: Spacing) -> None:
-    file.attrs["format"] = FORMAT
-    file.attrs["version"] = VERSION
-    file.attrs["created_utc"] = spacing.created_utc
-    file.attrs["command"] = spacing.command
-    file.attrs["machine"] = spacing.machine
-    file.attrs["versions"] = json.dumps(spacing.versions)
-    _store_text(file, "settings", json.dumps(spacing.settings), "the resolved configuration, JSON")
+    write_run(file, "spacing", VERSION, spacing.run)
+    store_text(file, "settings", json.dumps(spacing.settings), "the resolved configuration, JSON")
     sessions = file.create_group("sessions", track_order=True)
     for one in spacing.sessions:
         _write_session(sessions.create_group(one.name), one)
@@ -283,41 +305,12 @@ def _write_session(group: h5py.Group, one: SessionSpacing) -> None:
         binding = group.create_group("binding")
         for name in _BINDING:
             binding.attrs[name] = getattr(one.binding, name)
-    _store_text(group, "settings", json.dumps(one.settings), "what was recorded, JSON")
-    _store(
-        group,
-        "free",
-        one.free_m,
-        "m",
-        "bound",
-        "shifts proved to keep every clearance",
-    )
-    curve = group.create_group("curve")
-    _store(curve, "shift_m", one.curve.shift_m, "m", "exact", "how far the objects are moved")
-    _store(
-        curve,
-        "violated",
-        one.curve.violated,
-        "1",
-        "bound",
-        "frames that surely violate a clearance",
-    )
-    _store(
-        curve, "undecided", one.curve.undecided, "1", "bound", "frames of which that is not known"
-    )
+    store_text(group, "settings", json.dumps(one.settings), "what was recorded, JSON")
+    store(group, _FREE, one.free_m)
+    store_fields(group.create_group("curve"), one.curve, _CURVE_COLUMNS)
     frames = group.create_group("frames")
-    _store(frames, "index", one.frames.index, "1", "exact", "number of the frame in the session")
-    _store(frames, "time_s", one.frames.time_s, "s", "exact", "time since the recording began")
-    _store_text(frames, "reason", list(one.frames.reason), "why a frame could not be evaluated")
-    _store(
-        frames,
-        "n_measured",
-        one.frames.n_measured,
-        "1",
-        "exact",
-        "measurements of an object in a place",
-    )
-    _store(frames, "measure_s", one.frames.measure_s, "s", "exact", "how long they took")
+    store_fields(frames, one.frames, _FRAME_COLUMNS)
+    store_text(frames, "reason", list(one.frames.reason), "why a frame could not be evaluated")
     for name, what in (("violated", "certainly violate"), ("undecided", "may violate")):
         _store_stretches(frames, name, getattr(one.frames, name), "bound", f"shifts that {what}")
     standing = group.create_group("standing", track_order=True)
@@ -340,14 +333,7 @@ def _write_doubt(group: h5py.Group, doubt: SpacingDoubt) -> None:
         "estimate",
         "shifts at which a clearance is not sure to be kept, at 95 %",
     )
-    _store(
-        group,
-        "std_by_frame_m",
-        doubt.std_by_frame_m,
-        "m",
-        "estimate",
-        "standard deviation of the clearance, the largest of the objects moved",
-    )
+    store(group, _STD_BY_FRAME, doubt.std_by_frame_m)
 
 
 #: What is kept of a binding frame, each as an attribute.
@@ -365,10 +351,7 @@ _BINDING = (
 
 def _read(file: h5py.File) -> Spacing:
     return Spacing(
-        command=file.attrs["command"],
-        machine=file.attrs["machine"],
-        created_utc=file.attrs["created_utc"],
-        versions=json.loads(file.attrs["versions"]),
+        run=read_run(file),
         settings=json.loads(file["settings"].asstr()[()]),
         sessions=tuple(_read_session(name, group) for name, group in file["sessions"].items()),
     )
@@ -433,37 +416,16 @@ def _store_stretches(
     group: h5py.Group, name: str, stretches: Stretches, kind: Kind, what: str
 ) -> None:
     below = group.create_group(name)
-    _store(below, "offset", stretches.offset, "1", "exact", "where the rows of each frame begin")
-    _store(below, "shift_m", stretches.shift_m, "m", kind, f"begin and end of {what}")
-
-
-def _store(
-    group: h5py.Group,
-    name: str,
-    values: NDArray[Any],
-    unit: str,
-    kind: Kind,
-    description: str,
-) -> None:
-    dataset = group.create_dataset(name, data=values, chunks=True, **STORED)
-    dataset.attrs["unit"] = unit
-    dataset.attrs["kind"] = kind
-    dataset.attrs["description"] = description
-
-
-def _store_text(group: h5py.Group, name: str, text: str | list[str], description: str) -> None:
-    dataset = group.create_dataset(name, data=text, dtype=h5py.string_dtype(), track_times=False)
-    dataset.attrs["unit"] = "1"
-    dataset.attrs["kind"] = "exact"
-    dataset.attrs["description"] = description
+    store(below, _OFFSET, stretches.offset)
+    store(below, Described("shift_m", "m", kind, f"begin and end of {what}"), stretches.shift_m)
 
 
 def spacing_as_dict(spacing: Spacing) -> dict[str, Any]:
     """Return what a spacing found, as plain JSON values; numbers that are not there are None."""
     return {
-        "command": spacing.command,
-        "machine": spacing.machine,
-        "created_utc": spacing.created_utc,
+        "command": spacing.run.command,
+        "machine": spacing.run.machine,
+        "created_utc": spacing.run.created_utc,
         "settings": spacing.settings,
         "sessions": [_session_as_dict(one) for one in spacing.sessions],
     }

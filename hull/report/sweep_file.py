@@ -13,9 +13,8 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,9 +22,17 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.report.result_file import STORED, reading, writing
+from hybridve.hull.report.machine import Run
+from hybridve.hull.report.result_file import (
+    Described,
+    read_run,
+    reading,
+    store_fields,
+    store_text,
+    write_run,
+    writing,
+)
 
-FORMAT = "hybridve-sweep"
 VERSION = 1
 
 #: By how much of the time measured the cost model may be off in any row and yet hold.
@@ -251,9 +258,9 @@ class Sweep:
 
     Attributes
     ----------
-    command, machine, created_utc : str
-        As in a report.
-    versions, settings : dict
+    run : Run
+        Which run made it.
+    settings : dict
         As in a report.
     cameras : int
         n of the cost model.
@@ -261,10 +268,7 @@ class Sweep:
         What was asked, of what, and what came of it.
     """
 
-    command: str
-    machine: str
-    created_utc: str
-    versions: dict[str, str]
+    run: Run
     settings: dict[str, Any]
     cameras: int
     rows: SweepRows
@@ -273,51 +277,133 @@ class Sweep:
     engines: tuple[EngineSweep, ...]
 
 
-_ROW_COLUMNS = {
-    "viewport": ("1", "samples along every edge; 0 where each triangle has its own viewport"),
-    "accuracy_m": ("m", "accuracy by which each triangle was given its viewport; else NaN"),
-    "viewport_most": ("1", "the largest viewport of any triangle"),
-    "samples": ("1", "samples of all objects"),
-    "predicted_m": ("m", "largest edge / (u - 1) of any triangle: the accuracy predicted"),
-    "predicted_near_m": ("m", "the same over triangles not proved free in every frame"),
-}
-_FRAME_COLUMNS = {
-    "index": ("1", "number of the frame in the session"),
-    "decode_s": ("s", "reading the pictures, summed over the cameras"),
-    "segment_s": ("s", "cutting out the silhouettes, summed over the cameras"),
-    "hull_s": ("s", "integral images of the silhouettes"),
-    "boxes_s": ("s", "asking the bounding boxes of the objects"),
-    "certify_s": ("s", "certificates of the triangles; part of the truth, not of a query"),
-    "sample_s": ("s", "sampling the truth densely; part of the truth, not of a query"),
-    "triangles_asked": ("1", "triangles of the objects whose box is not proved free"),
-    "triangles_colliding": ("1", "triangles with a witness inside the hull, in double precision"),
-    "triangles_open": ("1", "triangles neither proved free nor with a witness"),
-    "objects_colliding": ("1", "objects with a triangle certified to collide"),
-    "truth_points": ("1", "true collision points that distances are measured from"),
-}
-_ENGINE_COLUMNS = {
-    "query_s": ("s", "seconds a frame of every repeat, mean over frames: hull to samples"),
-    "place_s": ("s", "seconds a frame of every repeat, mean over frames: samples to points"),
-    "time_s": ("s", "seconds a frame of every repeat: query and place"),
-    "time_median_s": ("s", "median of time_s over the repeats"),
-    "time_iqr_s": ("s", "interquartile range of time_s over the repeats"),
-    "points": ("1", "collision points a frame, mean"),
-    "triangles_missed": ("1", "triangles certified to collide without a sample, over all frames"),
-    "objects_missed": ("1", "objects certified to collide without a point, over all frames"),
-    "triangles_against_proof": ("1", "triangles with a sample although proved free"),
-    "distance_max_m": ("m", "largest distance of a true collision point to a reported one"),
-    "distance_p99_m": ("m", "99th percentile of that distance over dense samples of the truth"),
-    "distance_median_m": ("m", "median of that distance over dense samples of the truth"),
-    "within_predicted": ("1", "share of true points with a reported one within predicted_near_m"),
-    "on_front": ("1", "on the Pareto front of time, largest distance and objects missed"),
-}
-_COST_COLUMNS = {
-    "fitted": ("1", "whether the row was fitted; the others are foretold"),
-    "fill_px": ("1", "n m u^2 / 2 a frame: pixels filled in all cameras"),
-    "read_back_px": ("1", "window pixels, or samples inside the hull, read back a frame"),
-    "predicted_s": ("s", "seconds a frame of the model"),
-    "residual": ("1", "model less measured median, relative to the median"),
-}
+_ROW_COLUMNS = (
+    Described(
+        "viewport",
+        "1",
+        "exact",
+        "samples along every edge; 0 where each triangle has its own viewport",
+    ),
+    Described(
+        "accuracy_m",
+        "m",
+        "exact",
+        "accuracy by which each triangle was given its viewport; else NaN",
+    ),
+    Described("viewport_most", "1", "exact", "the largest viewport of any triangle"),
+    Described("samples", "1", "exact", "samples of all objects"),
+    Described(
+        "predicted_m",
+        "m",
+        "exact",
+        "largest edge / (u - 1) of any triangle: the accuracy predicted",
+    ),
+    Described(
+        "predicted_near_m", "m", "exact", "the same over triangles not proved free in every frame"
+    ),
+)
+_FRAME_COLUMNS = (
+    Described("index", "1", "exact", "number of the frame in the session"),
+    Described("decode_s", "s", "exact", "reading the pictures, summed over the cameras"),
+    Described("segment_s", "s", "exact", "cutting out the silhouettes, summed over the cameras"),
+    Described("hull_s", "s", "exact", "integral images of the silhouettes"),
+    Described("boxes_s", "s", "exact", "asking the bounding boxes of the objects"),
+    Described(
+        "certify_s",
+        "s",
+        "exact",
+        "certificates of the triangles; part of the truth, not of a query",
+    ),
+    Described(
+        "sample_s", "s", "exact", "sampling the truth densely; part of the truth, not of a query"
+    ),
+    Described(
+        "triangles_asked", "1", "exact", "triangles of the objects whose box is not proved free"
+    ),
+    Described(
+        "triangles_colliding",
+        "1",
+        "exact",
+        "triangles with a witness inside the hull, in double precision",
+    ),
+    Described("triangles_open", "1", "exact", "triangles neither proved free nor with a witness"),
+    Described("objects_colliding", "1", "exact", "objects with a triangle certified to collide"),
+    Described(
+        "truth_points", "1", "sampled", "true collision points that distances are measured from"
+    ),
+)
+_ENGINE_COLUMNS = (
+    Described(
+        "query_s",
+        "s",
+        "exact",
+        "seconds a frame of every repeat, mean over frames: hull to samples",
+    ),
+    Described(
+        "place_s",
+        "s",
+        "exact",
+        "seconds a frame of every repeat, mean over frames: samples to points",
+    ),
+    Described("time_s", "s", "exact", "seconds a frame of every repeat: query and place"),
+    Described("time_median_s", "s", "exact", "median of time_s over the repeats"),
+    Described("time_iqr_s", "s", "exact", "interquartile range of time_s over the repeats"),
+    Described("points", "1", "sampled", "collision points a frame, mean"),
+    Described(
+        "triangles_missed",
+        "1",
+        "sampled",
+        "triangles certified to collide without a sample, over all frames",
+    ),
+    Described(
+        "objects_missed",
+        "1",
+        "sampled",
+        "objects certified to collide without a point, over all frames",
+    ),
+    Described(
+        "triangles_against_proof", "1", "sampled", "triangles with a sample although proved free"
+    ),
+    Described(
+        "distance_max_m",
+        "m",
+        "sampled",
+        "largest distance of a true collision point to a reported one",
+    ),
+    Described(
+        "distance_p99_m",
+        "m",
+        "sampled",
+        "99th percentile of that distance over dense samples of the truth",
+    ),
+    Described(
+        "distance_median_m",
+        "m",
+        "sampled",
+        "median of that distance over dense samples of the truth",
+    ),
+    Described(
+        "within_predicted",
+        "1",
+        "sampled",
+        "share of true points with a reported one within predicted_near_m",
+    ),
+    Described(
+        "on_front",
+        "1",
+        "sampled",
+        "on the Pareto front of time, largest distance and objects missed",
+    ),
+)
+_COST_COLUMNS = (
+    Described("fitted", "1", "exact", "whether the row was fitted; the others are foretold"),
+    Described("fill_px", "1", "exact", "n m u^2 / 2 a frame: pixels filled in all cameras"),
+    Described(
+        "read_back_px", "1", "exact", "window pixels, or samples inside the hull, read back a frame"
+    ),
+    Described("predicted_s", "s", "estimate", "seconds a frame of the model"),
+    Described("residual", "1", "estimate", "model less measured median, relative to the median"),
+)
 _COST_ATTRIBUTES = (
     "fixed_s",
     "transform_most_s",
@@ -355,25 +441,13 @@ def read_sweep(path: Path) -> Sweep:
         return _read(file)
 
 
-def utc_now() -> str:
-    """Return the time as files give it."""
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
 def _write(file: h5py.File, sweep: Sweep) -> None:
-    file.attrs["format"] = FORMAT
-    file.attrs["version"] = VERSION
-    file.attrs["created_utc"] = sweep.created_utc
-    file.attrs["command"] = sweep.command
-    file.attrs["machine"] = sweep.machine
-    file.attrs["versions"] = json.dumps(sweep.versions)
+    write_run(file, "sweep", VERSION, sweep.run)
     file.attrs["cameras"] = sweep.cameras
-    text = file.create_dataset("settings", data=json.dumps(sweep.settings))
-    text.attrs["unit"] = "1"
-    text.attrs["description"] = "the resolved configuration, JSON"
+    store_text(file, "settings", json.dumps(sweep.settings), "the resolved configuration, JSON")
     rows = file.create_group("rows")
-    _store(rows, sweep.rows, _ROW_COLUMNS)
-    _store(file.create_group("frames"), sweep.frames, _FRAME_COLUMNS)
+    store_fields(rows, sweep.rows, _ROW_COLUMNS)
+    store_fields(file.create_group("frames"), sweep.frames, _FRAME_COLUMNS)
     file.create_group("truth").attrs.update(asdict(sweep.truth))
     engines = file.create_group("engines", track_order=True)
     for engine in sweep.engines:
@@ -381,19 +455,16 @@ def _write(file: h5py.File, sweep: Sweep) -> None:
         group.attrs["renderer"] = engine.renderer
         group["viewport"] = rows["viewport"]  # the same dataset, so that a group says all
         group["predicted_near_m"] = rows["predicted_near_m"]
-        _store(group, engine, _ENGINE_COLUMNS)
+        store_fields(group, engine, _ENGINE_COLUMNS)
         if engine.cost is not None:
             cost = group.create_group("cost")
-            _store(cost, engine.cost, _COST_COLUMNS)
+            store_fields(cost, engine.cost, _COST_COLUMNS)
             cost.attrs.update({name: getattr(engine.cost, name) for name in _COST_ATTRIBUTES})
 
 
 def _read(file: h5py.File) -> Sweep:
     return Sweep(
-        command=file.attrs["command"],
-        machine=file.attrs["machine"],
-        created_utc=file.attrs["created_utc"],
-        versions=json.loads(file.attrs["versions"]),
+        run=read_run(file),
         settings=json.loads(file["settings"].asstr()[()]),
         cameras=int(file.attrs["cameras"]),
         rows=_load(SweepRows, file["rows"], _ROW_COLUMNS),
@@ -415,18 +486,11 @@ def _read(file: h5py.File) -> Sweep:
     )
 
 
-def _store(group: h5py.Group, value: object, columns: Mapping[str, tuple[str, str]]) -> None:
-    for name, (unit, description) in columns.items():
-        dataset = group.create_dataset(name, data=getattr(value, name), chunks=True, **STORED)
-        dataset.attrs["unit"] = unit
-        dataset.attrs["description"] = description
-
-
 def _load(
-    kind: type[Loaded], group: h5py.Group, columns: Mapping[str, tuple[str, str]], **others: Any
+    kind: type[Loaded], group: h5py.Group, columns: Sequence[Described], **others: Any
 ) -> Loaded:
     wanted = {field.name for field in fields(kind)}  # type: ignore[arg-type]  # all are dataclasses
-    return kind(**{name: group[name][()] for name in columns if name in wanted}, **others)
+    return kind(**{c.name: group[c.name][()] for c in columns if c.name in wanted}, **others)
 
 
 def _attributes(group: h5py.Group) -> dict[str, Any]:
@@ -447,9 +511,9 @@ def sweep_as_dict(sweep: Sweep) -> dict[str, Any]:
     asked, n_open = int(frames.triangles_asked.sum()), int(frames.triangles_open.sum())
     colliding = int(frames.triangles_colliding.sum())
     return {
-        "command": sweep.command,
-        "machine": sweep.machine,
-        "created_utc": sweep.created_utc,
+        "command": sweep.run.command,
+        "machine": sweep.run.machine,
+        "created_utc": sweep.run.created_utc,
         "frames": frames.index.tolist(),
         "cameras": sweep.cameras,
         "stage_ms": {

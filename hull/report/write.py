@@ -13,7 +13,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -24,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 from hybridve.hull.contact.finding import Finding
 from hybridve.hull.report.collisions import Runs, StoredMesh
-from hybridve.hull.report.result_file import STORED
+from hybridve.hull.report.machine import utc_now
+from hybridve.hull.report.result_file import STORED, store, store_text, write_run, writing
 from hybridve.hull.report.schema import (
     CAMERA_COLUMNS,
-    FORMAT,
     FRAME_COLUMNS,
     MESH_COLUMNS,
     PATCH_COLUMNS,
@@ -141,10 +141,8 @@ class ReportWriter:
         started = time.perf_counter()
         columns = _columns(self._pending, self._header)
         part = self._parts / f"{self.n_done:09d}.npz"
-        partial = part.with_suffix(".partial")
-        with partial.open("wb") as file:
+        with appearing(part) as partial, partial.open("wb") as file:
             np.savez(file, **columns)  # type: ignore[arg-type]  # the stub takes the names for options
-        partial.replace(part)
         self.n_done += len(self._pending)
         self._pending, self._n_pending_runs = [], 0
         self._write_s += time.perf_counter() - started
@@ -166,34 +164,20 @@ class ReportWriter:
     def finish(self) -> None:
         """Make the parts the report."""
         self._flush()
-        partial = self._path.with_name(self._path.name + ".partial")
-        try:
-            with h5py.File(partial, "w") as file:
-                self._write(file)
-            partial.replace(self._path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise ReportError(f"{self._path}: cannot be written: {error}") from error
+        with writing(self._path) as file:
+            self._write(file)
         shutil.rmtree(self._parts)
 
     def _write(self, file: h5py.File) -> None:
         header = self._header
-        file.attrs["format"] = FORMAT
-        file.attrs["version"] = VERSION
-        file.attrs["created_utc"] = datetime.now(UTC).isoformat(timespec="seconds")
-        file.attrs["command"] = header.command
-        file.attrs["machine"] = header.machine
+        write_run(file, "report", VERSION, replace(header.run, created_utc=utc_now()))
         file.attrs["engine"] = header.engine
         file.attrs["renderer"] = header.renderer
-        file.attrs["versions"] = json.dumps(header.versions)
         for name, value, description in (
             ("configuration", header.settings, "the resolved configuration, JSON"),
             ("rig", header.rig, "the rig as in rig.json, each camera with mask_shift_px, JSON"),
         ):
-            text = file.create_dataset(f"hybridve/settings/{name}", data=json.dumps(value))
-            text.attrs["unit"] = "1"
-            text.attrs["kind"] = "exact"
-            text.attrs["description"] = description
+            store_text(file, f"hybridve/settings/{name}", json.dumps(value), description)
         self._store(file["hybridve/settings"], _ORIGIN, np.array(header.local_origin_m))
         file["hybridve/settings"].attrs[_ORIGIN.name] = header.local_origin_m
 
@@ -239,13 +223,9 @@ class ReportWriter:
             encoded = [str(text).encode() for text in values]
             kind = h5py.string_dtype("utf-8", max(1, *(len(text) for text in encoded)))
             values = np.array(encoded, kind)
-        dataset = group.create_dataset(column.name, data=values, chunks=True, **STORED)
-        self._describe(dataset, column)
+        self._name_cameras(store(group, column, values), column)
 
-    def _describe(self, dataset: h5py.Dataset, column: Column[Any]) -> None:
-        dataset.attrs["unit"] = column.unit
-        dataset.attrs["kind"] = column.kind
-        dataset.attrs["description"] = column.description
+    def _name_cameras(self, dataset: h5py.Dataset, column: Column[Any]) -> None:
         if "C" in column.shape:
             dataset.attrs["cameras"] = list(self._header.cameras)
 
@@ -286,7 +266,8 @@ class ReportWriter:
             maxshape=(None, *column.shape),
             **STORED,
         )
-        self._describe(dataset, column)
+        column.describe(dataset)
+        self._name_cameras(dataset, column)
         start = 0
         for values in parts:
             stop = start + len(values)

@@ -49,4 +49,4 @@ def write_picture_of(path: Path, sweep: Sweep) -> None:
         note = "nothing collides in these frames: accuracy was not measured"
     elif most := max(int(engine.objects_missed.max()) for engine in sweep.engines):
         note = f"distances leave out objects missed altogether: {most} at most, over all frames"
-    write_chart(path, curves, rows.labels[-1], title=title, subtitle=sweep.machine, note=note)
+    write_chart(path, curves, rows.labels[-1], title=title, subtitle=sweep.run.machine, note=note)

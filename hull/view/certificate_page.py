@@ -17,13 +17,16 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from hybridve.calib.errors import ReportError
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.files import appearing
 from hybridve.calib.judging.certificate import Certificate, SeenPoints, Volume
 from hybridve.calib.lens import parameter_names
+from hybridve.calib.record import NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.covariance import parameter_slices
-from hybridve.hull.view.certificate_charts import draw_camera, draw_errors, draw_rig
+from hybridve.hull.view.certificate_charts import draw_camera
+from hybridve.hull.view.rig_charts import draw_errors, draw_rig
 
 #: What a page can say at first sight.
 State = Literal["good", "limits", "refused"]
@@ -123,7 +126,7 @@ def write_certificate_page(
 
     Raises
     ------
-    ReportError
+    CalibrationError
         If it cannot be written.
     ValueError
         If the rig has no covariance, or the certificate is that of other cameras.
@@ -157,14 +160,11 @@ def write_certificate_page(
             "</body>\n</html>\n",
         ]
     )
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        with appearing(path) as partial:
+            partial.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+        raise CalibrationError(f"{path}: cannot be written: {error}") from error
 
 
 def state_of(certificate: Certificate, max_error_m: float | None = None) -> State:
@@ -265,6 +265,7 @@ def _verdict(rig: Rig, certificate: Certificate, title: str, max_error_m: float 
             f"of boards seen by {len(rig.cameras)} "
             f"camera{'' if len(rig.cameras) == 1 else 's'}; {noise.n_parameters} parameters",
         ),
+        *_second_opinion(certificate.second_opinion),
     ]
     boxes = "\n".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in numbers)
     listed = ""
@@ -278,6 +279,22 @@ def _verdict(rig: Rig, certificate: Certificate, title: str, max_error_m: float 
         f'<p class="words">{escape(certificate.verdict)}</p>{asked}</div>\n'
         f'<div class="numbers">\n{boxes}\n</div>\n{listed}'
     )
+
+
+def _second_opinion(opinion: SecondOpinion | NoOpinion | None) -> list[tuple[str, str]]:
+    """Return what another adjustment says, as a number and what it is."""
+    if opinion is None:
+        return []
+    if isinstance(opinion, NoOpinion):
+        return [("none", f"second opinion: {escape(opinion.reason)}")]
+    return [
+        (
+            _mm(max(opinion.difference95_m, 1e-6)),
+            "second opinion: within this of where the rig does, COLMAP's own adjustment places "
+            f"points (95 %); {_fixed(opinion.sigmas, 1)} standard deviations of its "
+            f"error, {_mm(opinion.expected95_m)} (95 %)",
+        )
+    ]
 
 
 def _limits(certificate: Certificate) -> str:

@@ -13,12 +13,13 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 
 #: What a chart may be written as.
 SUFFIXES = (".png", ".svg", ".pdf")
 
 #: Okabe and Ito's colours, told apart by the colour-blind; a marker each for black and white.
-_STYLES = (
+STYLES = (
     ("#0072B2", "o"),
     ("#D55E00", "s"),
     ("#009E73", "^"),
@@ -133,25 +134,23 @@ def write_chart(
     ValueError
         If the name has another ending.
     """
-    _refuse_suffix(path)
-    _save(draw_chart(curves, chosen, title=title, subtitle=subtitle, note=note), path)
+    refuse_suffix(path)
+    save_figure(draw_chart(curves, chosen, title=title, subtitle=subtitle, note=note), path)
 
 
-def _refuse_suffix(path: Path) -> None:
+def refuse_suffix(path: Path) -> None:
+    """Raise ValueError if a chart cannot be written as a file of that name."""
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path}: charts are {', '.join(SUFFIXES)}")
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure, which appears only when it is complete."""
-    partial = path.with_name(path.name + ".partial")
     try:
-        figure.savefig(partial, format=path.suffix.lower()[1:], dpi=_DPI)
-        partial.replace(path)
+        with appearing(path) as partial:
+            figure.savefig(partial, format=path.suffix.lower()[1:], dpi=_DPI)
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def draw_chart(
@@ -162,7 +161,7 @@ def draw_chart(
     FigureCanvasAgg(figure)
     tradeoff, missed = figure.subplots(1, 2, width_ratios=(2.2, 1))
     for number, curve in enumerate(curves):
-        colour, marker = _STYLES[number % len(_STYLES)]
+        colour, marker = STYLES[number % len(STYLES)]
         _draw_tradeoff(tradeoff, curve, colour, marker)
         # Methods mostly miss the same: each later one is drawn smaller, so that all are seen.
         _draw_missed(missed, curve, colour, marker, shrink=number / len(curves))
@@ -337,8 +336,8 @@ def write_clearances(
     ValueError
         If the name has another ending.
     """
-    _refuse_suffix(path)
-    _save(draw_clearances(curves, title=title, note=note), path)
+    refuse_suffix(path)
+    save_figure(draw_clearances(curves, title=title, note=note), path)
 
 
 def draw_clearances(curves: Sequence[ClearanceCurve], *, title: str, note: str = "") -> Figure:

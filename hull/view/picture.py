@@ -3,8 +3,6 @@
 What a person looks at first: cameras, the hull, the CAD, and in red what collides.
 """
 
-import os
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 from hybridve.calib.rig import Rig
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import hull_cells
@@ -286,13 +285,10 @@ def write_picture(path: Path, image: Image) -> None:
         ) from error
     if not good:
         raise ReportError(f"{path}: the picture could not be encoded as {path.suffix}")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        partial.write_bytes(encoded.tobytes())
-        partial.replace(path)
+        with appearing(path) as partial:
+            partial.write_bytes(encoded.tobytes())
     except OSError as error:
-        with suppress(OSError):  # there may be no folder to remove it from
-            partial.unlink()
         raise ReportError(
             f"{path}: cannot be written ({error.strerror}); name a place that can"
         ) from error

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from hybridve.hull.view.chart import _STYLES, _refuse_suffix, _save
+from hybridve.hull.view.chart import STYLES, refuse_suffix, save_figure
 
 _SIZE_IN = (10.0, 5.2)
 
@@ -81,8 +81,8 @@ def write_spacing_chart(path: Path, curves: Sequence[ShiftCurve], *, title: str)
     ValueError
         If the name has another ending.
     """
-    _refuse_suffix(path)
-    _save(draw_spacing_chart(curves, title=title), path)
+    refuse_suffix(path)
+    save_figure(draw_spacing_chart(curves, title=title), path)
 
 
 def draw_spacing_chart(curves: Sequence[ShiftCurve], *, title: str) -> Figure:
@@ -96,7 +96,7 @@ def draw_spacing_chart(curves: Sequence[ShiftCurve], *, title: str) -> Figure:
         for counts in (curve.at_most, *(() if curve.doubt is None else (curve.doubt.unsure,)))
     )
     for number, curve in enumerate(curves):
-        colour, marker = _STYLES[number % len(_STYLES)]
+        colour, marker = STYLES[number % len(STYLES)]
         # Curves often lie on each other: earlier ones are drawn wider, so that all are seen.
         width = 1.5 + 2.5 * (1.0 - (number + 1) / len(curves))
         label = f"{curve.name}: {_shift_text(curve.answer_mm)}"

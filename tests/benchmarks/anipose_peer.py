@@ -21,10 +21,8 @@ def main() -> None:
     columns, rows, square_m = int(given["columns"]), int(given["rows"]), float(given["square_m"])
     # In millimetres, as its users have it: it weighs the board's shape by the unit.
     board = Checkerboard(columns, rows, square_length=1000.0 * square_m)
-    cameras = []
-    for index in range(len(pixels)):
-        cameras.append(Camera(name=f"{index}", size=tuple(map(int, given["size_px"]))))
-    group = CameraGroup(cameras)
+    size_px = tuple(map(int, given["size_px"]))
+    group = CameraGroup([Camera(name=f"{index}", size=size_px) for index in range(len(pixels))])
     detections = [
         [
             {"framenum": (0, frame), "corners": seen[:, None], "ids": board.ids.copy()}

@@ -19,8 +19,8 @@ from hybridve.hull.capture.recording import FrameRange
 from hybridve.hull.capture.session import Session
 from hybridve.hull.chain import Chain, EvaluateSettings, rig_views
 from hybridve.hull.contact.detect import Body, make_body
+from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.respond import ResponseSettings
-from hybridve.hull.contact.uncertainty import DoubtSettings
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.choose import open_engine
 

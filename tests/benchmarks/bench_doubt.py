@@ -27,7 +27,8 @@ from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.components import FAR_M, pixel_rays
 from hybridve.hull.contact.detect import Contact, detect_contacts, make_body
 from hybridve.hull.contact.finding import agreed
-from hybridve.hull.contact.uncertainty import Doubt, Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubt, Doubter
 from hybridve.hull.query import walk_reference
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Hull, make_hull

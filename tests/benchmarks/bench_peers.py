@@ -40,7 +40,6 @@ from scipy.optimize import least_squares
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from helpers.colmap_adjust import colmap_adjust
 from helpers.theory import (
     BOARD,
     Scene,
@@ -54,10 +53,12 @@ from hybridve.calib.boards.board import Observations
 from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
+from hybridve.calib.placing.fixed_cameras import make_bundle
 from hybridve.calib.placing.link import link_cameras
 from hybridve.calib.pose import compose, invert, transform
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.bundle import Bundle, moved_pose
+from hybridve.calib.solving.bundle import moved_pose
+from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.lens_fit import LensSettings, fit_shared_lens, locate_board
 
 NOISE_PX = 0.3
@@ -185,21 +186,10 @@ def by_colmap(scene: Scene, observations: list[Observations]) -> Result:
     settings = LensSettings()
     lenses = [fit_shared_lens([BOARD], [seen], settings)[0] for seen in observations]
     linked = link_cameras([BOARD], lenses, observations, is_labelled=False)
-    bundle = Bundle(
-        points_board=(BOARD.points_board,),
-        cameras=tuple(
-            replace(lens.camera, cam_from_world=cam_from_rig)
-            for lens, cam_from_rig in zip(lenses, linked.cam_from_rig, strict=True)
-        ),
-        rig_from_body=linked.rig_from_body,
-        body_from_board=linked.body_from_board,
-        views=linked.views,
-        held_pose=0,
-        lens_of=tuple(range(len(lenses))),
-        fixed_lenses=frozenset(),
-        held_boards=frozenset({0}),
-    )
-    cameras = colmap_adjust(bundle).cameras
+    adjusted = colmap_adjust(make_bundle([BOARD], lenses, linked, {}))
+    if isinstance(adjusted, str):
+        raise RuntimeError(adjusted)
+    cameras = adjusted.cameras
     return cameras, time.perf_counter() - start, time.process_time() - cpu_start
 
 

@@ -46,9 +46,10 @@ from hybridve.hull.capture.recording import undistort_mask
 from hybridve.hull.capture.rig import calibrate_session, load_rig
 from hybridve.hull.capture.session import Session, load_session
 from hybridve.hull.chain import rig_views
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
 from hybridve.hull.contact.spacing import Move, blocked_shifts, free_of, union
 from hybridve.hull.contact.spacing_doubt import unsure_shifts
-from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubter
 from hybridve.hull.query.silhouettes import make_hull
 from hybridve.hull.spacing import Layout
 from hybridve.hull.synth import write

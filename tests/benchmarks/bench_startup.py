@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 from helpers.sessions import write_ball_session, write_cube_scene
 
-from hybridve.calib.formats.rigs import write_rig
+from hybridve.calib.formats.rig_json import write_rig
 
 PROJECT = Path(__file__).parent.parent.parent
 

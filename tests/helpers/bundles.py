@@ -6,8 +6,8 @@ import numpy as np
 
 from helpers.boards import board_poses, project, ring
 from hybridve.calib.boards.target import Chessboard
-from hybridve.calib.pose import compose, invert
-from hybridve.calib.solving.bundle import Bundle, BundleView, moved_pose
+from hybridve.calib.pose import compose, invert, rotation_about_axes
+from hybridve.calib.solving.bundle import Bundle, BundleView, moved_pose, view_residuals
 
 BOARD = Chessboard(7, 6, 0.1)
 
@@ -70,3 +70,42 @@ def perturbed(bundle: Bundle, seed: int, by: float = 0.01) -> Bundle:
             for board, pose in enumerate(bundle.body_from_board)
         ),
     )
+
+
+def back_to_back(noise_px: float = 0.0) -> Bundle:
+    """Two boards on one body; the first camera sees only one of them, the second the other."""
+    truth = make_bundle(["PINHOLE", "PINHOLE"], n_stills=0)
+    turn = rotation_about_axes((0.0, 180.0, 0.0))
+    body_from_second = np.column_stack([turn, [0.7, 0.02, -0.03]])
+    rng = np.random.default_rng(4)
+    poses = [np.eye(3, 4)]
+    for _ in range(14):
+        tilt = rotation_about_axes(tuple(rng.uniform(-25, 25, 3)))
+        poses.append(np.column_stack([tilt, rng.uniform(-0.1, 0.1, 3)]))
+    opposite = np.column_stack(
+        [rotation_about_axes((0.0, 180.0, 0.0)), [0.7, 0.0, 0.0]]
+    )  # the second camera looks at the body from behind
+    cameras = (
+        truth.cameras[0],
+        replace(
+            truth.cameras[1], cam_from_world=compose(truth.cameras[1].cam_from_world, opposite)
+        ),
+    )
+    bundle = replace(
+        truth,
+        points_board=(truth.points_board[0], truth.points_board[0]),
+        cameras=cameras,
+        rig_from_body=tuple(poses),
+        body_from_board=(np.eye(3, 4), body_from_second),
+        held_boards=frozenset({0}),
+        views=tuple(
+            BundleView(camera, pose, camera, np.zeros_like(truth.views[0].pixels), f"{pose}")
+            for pose in range(len(poses))
+            for camera in (0, 1)
+        ),
+    )
+    views = [
+        replace(view, pixels=rng.normal(0.0, noise_px, missed.shape) - missed)
+        for view, missed in zip(bundle.views, view_residuals(bundle), strict=True)
+    ]
+    return replace(bundle, views=tuple(views))

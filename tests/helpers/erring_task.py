@@ -16,6 +16,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.pose import moved_pose
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.hull.contact.clearance import ClearanceMeter
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
 from hybridve.hull.contact.spacing import (
     METER_SHARE,
     Move,
@@ -25,7 +26,7 @@ from hybridve.hull.contact.spacing import (
     union,
 )
 from hybridve.hull.contact.spacing_doubt import unsure_shifts
-from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubter
 from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 
 #: The lens: some 9 mm a pixel at 3 m.

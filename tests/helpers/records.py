@@ -12,6 +12,7 @@ from hybridve.calib.record import (
     ClipRecord,
     Labelling,
     Noise,
+    SecondOpinion,
     StillsRecord,
     WorldRecord,
 )
@@ -60,10 +61,24 @@ def make_record(names: Sequence[str], **changes: Any) -> CalibrationRecord:
         "world": WorldRecord(kind="board", text="the board", warnings=()),
         "settings": {},
         "adjustment": Adjustment(
-            steps=3, views=9, outliers=0, worst_outliers=(), left_out={}, warnings=()
+            steps=3,
+            views=9,
+            outliers=0,
+            worst_outliers=(),
+            left_out={},
+            warnings=(),
+            start="COLMAP's adjustment",
         ),
+        "second_opinion": make_opinion(0.1),
     }
     return CalibrationRecord(**(told | changes))
+
+
+def make_opinion(sigmas: float) -> SecondOpinion:
+    """A second opinion that differs by so many standard deviations of 1 mm (95 %: 3 mm)."""
+    return SecondOpinion(
+        difference95_m=1e-3 * sigmas, expected95_m=3e-3, sigmas=sigmas, difference95_px=sigmas
+    )
 
 
 def make_check(**changes: Any) -> RigCheck:

@@ -13,6 +13,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes, transform
 from hybridve.calib.rig import Rig
+from hybridve.calib.solving.bundle import Bundle, BundleView
 from hybridve.calib.solving.covariance import image_derivatives
 
 BOARD = Chessboard(9, 6, 0.1)
@@ -125,6 +126,28 @@ def observed(scene: Scene, noise_px: float, seed: int) -> list[Observations]:
         )
         for camera, own in zip(scene.cameras, sightings, strict=True)
     ]
+
+
+def bundle_of(scene: Scene, clip_px: float, stills_px: float, seed: int) -> Bundle:
+    """Return the truth as a bundle; its views have the noise of clip or stills, and say so."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for view in scene.views:
+        sigma_px = stills_px if view[3] is None else clip_px
+        pixels = scene.exact(view)
+        noisy = pixels + rng.normal(0.0, sigma_px, pixels.shape)
+        views.append(BundleView(view[0], view[1], 0, noisy, view[2], sigma_px))
+    return Bundle(
+        points_board=(BOARD.points_board,),
+        cameras=scene.cameras,
+        rig_from_body=scene.world_from_board,
+        body_from_board=(np.eye(3, 4),),
+        views=tuple(views),
+        held_pose=0,
+        lens_of=tuple(range(len(scene.cameras))),
+        fixed_lenses=frozenset(),
+        held_boards=frozenset({0}),
+    )
 
 
 # --- What theory allows -----------------------------------------------------------------------

@@ -92,6 +92,7 @@ def assert_exact(surface: SurfaceDistance, corners: NDArray[np.float64], points:
         assert abs(away_m - found_m) <= placed_m + 4.0 * np.spacing(away_m)
 
 
+@pytest.mark.slow
 @given(_POINTS, _POINTS, _POINTS, st.lists(_POINTS, min_size=1, max_size=3))
 @settings(max_examples=300)
 def test_distances_to_any_triangle_are_exact_but_for_rounding(
@@ -138,6 +139,7 @@ def about(rng: np.random.Generator, corners: NDArray[np.float64], n: int) -> NDA
 KINDS = ["sliver", "collinear", "needle", "line", "point", "speck"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_slivers_lines_and_points_are_measured_as_exactly(kind: str) -> None:
     rng = np.random.default_rng([11, KINDS.index(kind)])
@@ -147,6 +149,7 @@ def test_slivers_lines_and_points_are_measured_as_exactly(kind: str) -> None:
         assert_exact(one_triangle(corners), corners[None], about(rng, corners, 3))
 
 
+@pytest.mark.slow
 def test_among_others_thin_triangles_are_measured_as_exactly() -> None:
     """And who is measured first, and in which company, changes no bit."""
     rng = np.random.default_rng(12)
@@ -218,6 +221,7 @@ def solids(rng: np.random.Generator) -> list[Mesh]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_winding_numbers_are_those_of_rational_arithmetic(seed: int) -> None:
     """Points on a grid that the faces lie on, rays through edges and corners, last bits away."""
@@ -251,6 +255,7 @@ def test_winding_numbers_are_those_of_rational_arithmetic(seed: int) -> None:
     assert {-1, 0, 1, 2} <= numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_sides_do_not_depend_on_the_points_before(seed: int) -> None:
     """Sides are taken over from point to point where no surface is between."""

@@ -198,6 +198,7 @@ def test_an_obj_cut_off_is_refused_or_said_to_be_open(
         assert found == whole or found[0] == 4 or any("open edges" in note for note in cad.notes)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=8)
 def test_a_step_file_cut_off_reads_the_same_or_is_refused(
@@ -331,6 +332,7 @@ def test_assimp_places_fbx_models_where_we_do(folder: Path, inner: str, outer: s
     assert len(peer) == len(corners)
 
 
+@pytest.mark.slow
 def test_pycollada_and_open3d_count_what_we_count_of_what_they_read(folder: Path) -> None:
     """Triangles alone: what they make of other polygons is what they are not asked for."""
     import collada

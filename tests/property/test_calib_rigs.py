@@ -15,19 +15,12 @@ from numpy.typing import NDArray
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.foreign import rotation_vector
-from hybridve.calib.formats.rigs import (
-    FORMATS,
-    UNITS_M,
-    export_rig,
-    import_rig,
-    read_any_rig,
-    read_rig,
-    rig_to_dict,
-    write_rig,
-)
+from hybridve.calib.formats.rig_export import FORMATS, UNITS_M, export_rig
+from hybridve.calib.formats.rig_json import read_rig, rig_to_dict, write_rig
+from hybridve.calib.formats.rigs import import_rig, read_any_rig
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import compose, rotation_about_axes
-from hybridve.calib.record import MadeElsewhere
+from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 #: Text with 17 digits gives a projection back to this, in pixels.
@@ -75,6 +68,7 @@ def img_from_world(camera: Camera) -> NDArray[np.float64]:
     return np.asarray(camera.pinhole @ camera.cam_from_world)
 
 
+@pytest.mark.slow
 @given(
     camera=pinholes(),
     log_factor=st.floats(-8.0, 8.0),
@@ -293,7 +287,7 @@ def test_cameras_are_taken_from_a_rig_with_their_share_of_the_covariance(
     with tempfile.TemporaryDirectory() as folder:
         write_rig(Path(folder) / "rig.json", rig)
         taken = read_any_rig(Path(folder) / "rig.json", names=names)
-        sizes = {name: (640, 480) for name in names}
+        sizes = dict.fromkeys(names, (640, 480))
         imported = import_rig(Path(folder), "rig.json", None, None, sizes, None)
 
     assert rig_to_dict(taken) == rig_to_dict(imported) == rig_to_dict(rig.only(names))

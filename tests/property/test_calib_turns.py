@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+import pytest
 from helpers.turned_rigs import BOARDS, around, turned
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
@@ -10,6 +11,7 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.judging.check import check_rig
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(
     board=st.sampled_from(BOARDS),

@@ -11,13 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.scene import SceneObject
-from hybridve.hull.contact.backtrack import (
-    approach_speed,
-    first_contact,
-    interpolate_masks,
-    interpolated_hull,
-)
+from hybridve.hull.contact.backtrack import approach_speed, first_contact
+from hybridve.hull.contact.between import interpolated_hull
 from hybridve.hull.contact.detect import certify_contacts, detect_contacts, make_body
+from hybridve.hull.contact.outline_motion import interpolate_masks
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points
@@ -205,6 +202,7 @@ def touching_fraction(
 
 
 # Not shrunk: an example takes a tenth of a second.
+@pytest.mark.slow
 @settings(max_examples=30, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(
     radius_m=st.floats(0.04, 0.1),

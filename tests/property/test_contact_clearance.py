@@ -39,6 +39,7 @@ class Box:
         return outside + np.minimum(beyond.max(axis=1), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_bounds_hold_the_exact_distance_of_convex_hulls(seed: int) -> None:
     rng = np.random.default_rng([4, seed])
@@ -86,6 +87,7 @@ def _random_hull(rng: np.random.Generator) -> Hull:
     return make_hull(views, random_masks(rng, views, list(rng.choice(MASK_KINDS, n_cameras))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_no_point_of_any_hull_is_nearer_than_the_lower_bound(seed: int) -> None:
     """Blobs, holes, noise, half images, abstaining cameras: nothing about the hull is known."""

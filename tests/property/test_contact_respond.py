@@ -1,6 +1,7 @@
 """Rays and responses, whatever the rig and the silhouettes; the specification is the witness."""
 
 import numpy as np
+import pytest
 from helpers.contacts import contact_at
 from helpers.hulls import MASK_KINDS, random_masks, random_views
 from helpers.response import camera_center, random_unit
@@ -118,6 +119,7 @@ def collisions(draw: st.DrawFn) -> tuple[Hull, NDArray[np.float64], Response, Re
     return hull, start, answer, chosen
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(collision=collisions())
 def test_what_is_known_is_consistent_and_what_is_not_is_nan(
@@ -156,6 +158,7 @@ def test_what_is_known_is_consistent_and_what_is_not_is_nan(
         assert contains_points(hull, start + chosen.height_m * answer.v_rec * [[1 - 1e-9]]).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(collision=collisions())
 def test_the_paper_s_distance_is_within_a_step_of_the_exact_one(

@@ -75,6 +75,7 @@ def random_hull(rng: np.random.Generator) -> Hull:
     return make_hull(views, random_masks(rng, views, list(rng.choice(_KINDS, n_cameras))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_every_shift_is_what_measuring_there_says(seed: int) -> None:
     """Blobs, holes, half images; closed objects and open ones."""

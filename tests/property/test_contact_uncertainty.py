@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 from helpers.cones import BOX_FACES, box_vertices, views_from
 from helpers.contacts import FREE
 from helpers.hulls import (
@@ -18,7 +19,8 @@ from hypothesis import strategies as st
 from hybridve.hull.contact.bulge import Ray, farthest_on, real_upper
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import grown
-from hybridve.hull.contact.uncertainty import Doubter, DoubtSettings, outline_errors
+from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
+from hybridve.hull.contact.uncertainty import Doubter
 from hybridve.hull.query.silhouettes import Hull, Unseen, make_hull
 
 BOX_HALF_M = 0.1
@@ -48,6 +50,7 @@ def hull_beside_box(seed: int, n_cameras: int, n_balls: int) -> tuple[Hull, floa
     return make_hull(views, seen), max(nearest_m, 0.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(seed=seeds, n_cameras=st.integers(2, 5), n_balls=st.integers(1, 3))
 def test_the_real_thing_is_not_farther_away_than_the_bound(

@@ -93,6 +93,7 @@ def ask(engine: Native | Compute | Stencil | Reference, hull: Hull, mesh: Triang
     return hits
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.parametrize(
     ("name", "band_px"),
@@ -112,6 +113,7 @@ def test_an_engine_takes_the_samples_of_the_reference(
     assert differences(hull.views, mesh, found, expected, band_px).outside_band == []
 
 
+@pytest.mark.slow
 @examples
 @given(scene=scenes())
 def test_native_takes_the_same_samples_without_rejection(
@@ -144,6 +146,7 @@ def test_another_camera_only_carves(native: Native, scene: tuple[Hull, Triangles
     assert set(keys(of_all).tolist()) <= set(keys(of_fewer).tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.parametrize("engine_type", [Reference, Native, Compute, Stencil])
 @examples

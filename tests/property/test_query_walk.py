@@ -1,9 +1,10 @@
 """The compiled walk tells what its specification does, whatever the rig and the silhouettes."""
 
 import numpy as np
+import pytest
 from helpers.hulls import EMPTYING_MASK_KINDS, MASK_KINDS, random_masks, random_views
 from helpers.response import camera_center, random_unit
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -39,6 +40,7 @@ def rays(draw: st.DrawFn) -> Rays:
     return hull, starts, units
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(rays=rays(), reach_m=st.sampled_from([0.05, 4.0, 1e3, 1e7]))
 def test_the_compiled_walk_is_the_specification(rays: Rays, reach_m: float) -> None:
@@ -72,6 +74,8 @@ PLACES = ((1e-6, 0.0), (1e3, 0.0), (1e6, 0.0), (1e9, 0.0), (1.0, 1e4), (1.0, 5e6
 
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), place=st.sampled_from(PLACES))
+@example(seed=29301, place=(1.0, 1e4))  # a corner that the projection passes slowly
+@example(seed=29301, place=(1e-6, 0.0))
 def test_stretches_are_the_same_in_every_unit_and_place(
     seed: int, place: tuple[float, float]
 ) -> None:

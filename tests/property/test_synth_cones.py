@@ -152,6 +152,7 @@ def test_cells_that_hold_a_camera_hide_nothing_of_the_hull() -> None:
     assert 0.2 - 1e-6 <= found.distance_m <= 0.2 + RESOLUTION_M
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(place=places, radius_m=sizes, offset=offsets, camera=st.integers(0, 3))
 def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
@@ -175,6 +176,7 @@ def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
     assert beyond.distance_m == np.inf
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     place=places,
