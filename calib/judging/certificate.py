@@ -547,10 +547,11 @@ def opinion_text(opinion: SecondOpinion | NoOpinion) -> str:
     """Return a second opinion in words."""
     if isinstance(opinion, NoOpinion):
         return f"no second opinion: {opinion.reason}"
+    within_mm = millimetres(max(opinion.difference95_m, _FINEST_M))
     return (
         "second opinion: COLMAP's own adjustment places what the cameras see within "
-        f"{millimetres(max(opinion.difference95_m, _FINEST_M))} mm of where the rig does (95 %), or "
-        f"{opinion.sigmas:.1f} standard deviations of its error, which is "
+        f"{within_mm} mm of where the rig does (95 %), or {opinion.sigmas:.1f} standard "
+        "deviations of its error, which is "
         f"{millimetres(opinion.expected95_m)} mm (95 %)"
     )
 
