@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridve.calib.solving.least_squares import (
+    Limits,
     NormalEquations,
     Step,
-    Stopping,
     minimized,
     soft_l1,
     soft_l1_rows,
@@ -15,7 +15,7 @@ from hybridve.calib.solving.least_squares import (
 )
 
 N_SHARED, N_BLOCKS, N_BLOCK = 5, 7, 3
-CLOSE = Stopping(100, 1e-15)
+CLOSE = Limits(100, 1e-15)
 
 
 def some_equations(seed: int = 0) -> tuple[NormalEquations, NDArray[np.float64]]:
@@ -139,14 +139,14 @@ def test_it_ends_where_no_step_serves_and_after_so_many_steps() -> None:
     found = minimized(Flat(), start, CLOSE)
     assert found.state is start
     assert found.n_steps < CLOSE.max_steps
-    assert minimized(Curve(), start, Stopping(3, 1e-15)).n_steps == 3
+    assert minimized(Curve(), start, Limits(3, 1e-15)).n_steps == 3
 
 
 def test_what_a_step_may_gain_and_need_not_ends_it() -> None:
     near = np.array([1.0 + 1e-4, 1.0])
     problem = Curve()
-    assert minimized(problem, near, Stopping(100, 0.0, floor=1.0)).n_steps == 1
-    assert minimized(problem, near, Stopping(100, 0.0, floor=1e-20)).n_steps > 1
+    assert minimized(problem, near, Limits(100, 0.0, floor=1.0)).n_steps == 1
+    assert minimized(problem, near, Limits(100, 0.0, floor=1e-20)).n_steps > 1
 
 
 def test_soft_l1_is_the_square_near_and_the_length_far_away() -> None:

@@ -13,7 +13,7 @@ from hybridve.calib.placing.board_tracks import Tracks, interpolated
 from hybridve.calib.placing.clock_start import MIN_COMMON, Start
 from hybridve.calib.pose import Pose, compose, invert, moved_pose
 from hybridve.calib.solving.consensus import pose_distances
-from hybridve.calib.solving.least_squares import NormalEquations, Step, Stopping, minimized
+from hybridve.calib.solving.least_squares import Limits, NormalEquations, Step, minimized
 
 #: Instants adjusted together at most.
 _MAX_INSTANTS = 80
@@ -165,8 +165,8 @@ class ClockProblem:
     def solve(self) -> _Found:
         """Fit everything, robustly."""
         sampled = self.sampled(self.offsets, self.cam_from_rig, self.rig_from_board)
-        stopping = Stopping(_MAX_STEPS, _COST_SHARE)
-        sampled = minimized(self._robust(sampled), sampled, stopping, self._robust).state
+        limits = Limits(_MAX_STEPS, _COST_SHARE)
+        sampled = minimized(self._robust(sampled), sampled, limits, self._robust).state
         weights = _weights(sampled, _outlier_px(sampled))
         reduced = self.normal_equations(sampled, weights).reduced()
         normal = reduced.information

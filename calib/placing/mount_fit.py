@@ -31,9 +31,9 @@ from hybridve.calib.pose import (
 from hybridve.calib.rig import Mount
 from hybridve.calib.solving.least_squares import (
     FLOOR_PX,
+    Limits,
     NormalEquations,
     Step,
-    Stopping,
     minimized,
 )
 
@@ -327,8 +327,8 @@ def _refine(camera: Camera, views: list[MountedView], mount: Mount) -> Mount:
     """
     problem = _MountProblem(camera, views)
     start = problem.projected(mount)
-    stopping = Stopping(_MAX_STEPS, _COST_SHARE, len(start.residuals) * FLOOR_PX**2)
-    return minimized(problem, start, stopping).state.mount
+    limits = Limits(_MAX_STEPS, _COST_SHARE, len(start.residuals) * FLOOR_PX**2)
+    return minimized(problem, start, limits).state.mount
 
 
 @dataclass(frozen=True, slots=True, eq=False)

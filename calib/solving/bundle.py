@@ -33,9 +33,9 @@ from hybridve.calib.pose import Pose, transform
 from hybridve.calib.pose import moved_pose as moved_pose
 from hybridve.calib.solving.least_squares import (
     FLOOR_PX,
+    Limits,
     NormalEquations,
     Step,
-    Stopping,
     minimized,
     soft_l1,
     soft_l1_weights,
@@ -221,7 +221,7 @@ def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
             f"the joint adjustment cannot start: its lens does not see the board in {lost}"
         )
     floor = sum(map(len, start.residuals)) * FLOOR_PX**2
-    found = minimized(problem, start, Stopping(_MAX_STEPS, _COST_SHARE, floor))
+    found = minimized(problem, start, Limits(_MAX_STEPS, _COST_SHARE, floor))
     adjusted = found.state
     return Adjusted(
         adjusted.bundle,

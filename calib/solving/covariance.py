@@ -34,6 +34,9 @@ from hybridve.calib.solving.bundle import (
     make_layout,
 )
 
+#: Of the largest eigenvalue: what is below is rounding.
+_ROUNDING = 1e-15
+
 #: What is smooth over a board: polynomials in its coordinates up to this degree.
 _SMOOTH_DEGREE = 3
 
@@ -252,9 +255,15 @@ def _prior(bundle: Bundle, layout: Layout) -> NDArray[np.float64]:
 
 
 def _inverted(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverse of a positive definite matrix whose units differ along the diagonal."""
+    """Return the inverse of a positive definite matrix whose units differ along the diagonal.
+
+    What rounding leaves of a direction that nothing tells may be negative: it counts as the least
+    that rounding lets be told, so that no variance is.
+    """
     scale = np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    half = vectors / np.sqrt(np.maximum(values, _ROUNDING * values[-1])) / scale[:, None]
+    return np.asarray(half @ half.T)
 
 
 def _of_rig(bundle: Bundle, layout: Layout, inverse: NDArray[np.float64]) -> RigCovariance:

@@ -31,8 +31,8 @@ _LEAST_DAMPING = 1e-13
 _MOST_DAMPING = 1e12
 _DAMPING_FACTOR = 10.0
 
-#: Of the largest eigenvalue: what is below is rounding.
-_ROUNDING = _LEAST_DAMPING
+#: A direction that is told by less than this share of what is told best is not known.
+_ROUNDING = 1e-13
 
 #: The length of a residual that nobody asks for, pixels.
 FLOOR_PX = 1e-9
@@ -129,16 +129,19 @@ class NormalEquations:
         information[np.diag_indices(n_shared)] += damping * np.diag(self.shared)
         return Reduced(information, self.shared_right - mixed.T @ alone.ravel(), back, alone)
 
-    def step(self, damping: float) -> Step:
-        """Return the damped step downhill, along what the data tell."""
+    def step(self, damping: float, rounding: float = _ROUNDING) -> Step:
+        """Return the damped step downhill, along what the data tell.
+
+        What rounding leaves of a direction that they do not tell, an eigenvalue below a share of
+        the largest, is not walked along.
+        """
         reduced = self.reduced(damping)
         diagonal = np.diag(self.shared)
         scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
         scaled = reduced.information / np.outer(scale, scale)
         scaled[np.diag_indices(len(scaled))] += diagonal <= 0.0
         values, vectors = np.linalg.eigh(scaled)
-        # What rounding leaves of a direction that the data do not tell is not walked along.
-        known = values > _ROUNDING * values.max(initial=0.0)
+        known = values > rounding * values.max(initial=0.0)
         vectors = vectors[:, known] / scale[:, None]
         shared = vectors @ ((vectors.T @ reduced.right) / values[known])
         return Step(shared, reduced.alone - reduced.back @ shared)
@@ -164,8 +167,8 @@ class Problem(Protocol[State]):
 
 
 @dataclass(frozen=True, slots=True)
-class Stopping:
-    """When a minimum is good enough.
+class Limits:
+    """How far least squares go.
 
     Attributes
     ----------
@@ -175,11 +178,14 @@ class Stopping:
         A step that gains no more than this share of the cost is the last, ...
     floor : float
         ... and than this.
+    rounding : float
+        Directions that are told by less than this share of what is told best are not walked along.
     """
 
     max_steps: int
     share: float
     floor: float = 0.0
+    rounding: float = _ROUNDING
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,7 +210,7 @@ class Minimum(Generic[State]):
 def minimized(
     problem: Problem[State],
     start: State,
-    stopping: Stopping,
+    limits: Limits,
     seen_from: Callable[[State], Problem[State]] | None = None,
 ) -> Minimum[State]:
     """Return the minimum that lies downhill of a start.
@@ -218,20 +224,20 @@ def minimized(
         What is adjusted.
     start : State
         Where from.
-    stopping : Stopping
-        When it is good enough.
+    limits : Limits
+        How far.
     seen_from : callable, optional
         Returns the problem as it looks from where a step led, if its loss follows the residuals.
     """
     state, cost, damping = start, problem.cost(start), _FIRST_DAMPING
     normal: NormalEquations | None = None
     n_steps = 0
-    while n_steps < stopping.max_steps and damping < _MOST_DAMPING:
+    while n_steps < limits.max_steps and damping < _MOST_DAMPING:
         n_steps += 1
         if normal is None:
             normal = problem.normal_equations(state)
-        step = normal.step(damping)
-        enough = stopping.share * cost + stopping.floor
+        step = normal.step(damping, limits.rounding)
+        enough = limits.share * cost + limits.floor
         is_last = normal.length_of(step) ** 2 <= enough
         moved = problem.moved(state, step)
         moved_cost = np.inf if moved is None else problem.cost(moved)

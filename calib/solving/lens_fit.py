@@ -31,9 +31,9 @@ from hybridve.calib.record import LensChoice
 from hybridve.calib.solving.bundle import POSE, lens_derivatives
 from hybridve.calib.solving.least_squares import (
     FLOOR_PX,
+    Limits,
     NormalEquations,
     Step,
-    Stopping,
     minimized,
     soft_l1,
     soft_l1_rows,
@@ -125,6 +125,10 @@ _LEAST_COVER = 0.4
 _COST_SHARE = 1e-15
 _ROUGH = 1e-3
 _MAX_STEPS = 200
+
+#: A direction that is told by less than this share of what is told best is not known: of a lens of
+#: many coefficients, views tell some combinations 1e-14 as well as others.
+_ROUNDING = 3e-15
 
 
 @dataclass(frozen=True, slots=True)
@@ -453,8 +457,8 @@ def adjust_lens(
     """
     mask = are_finite(batch_residuals(camera, poses, batch))
     problem = _LensProblem(batch.only(mask), mask, loss_px, free, move_poses)
-    stopping = Stopping(max_steps, tolerance, max(1, mask.sum()) * FLOOR_PX**2)
-    found = minimized(problem, problem.projected(camera, poses), stopping)
+    limits = Limits(max_steps, tolerance, max(1, mask.sum()) * FLOOR_PX**2, _ROUNDING)
+    found = minimized(problem, problem.projected(camera, poses), limits)
     normal = problem.normal_equations(found.state)
     reduced = normal.reduced()
     yielded = np.einsum("vip,vi->vp", reduced.back, normal.blocks_right)
@@ -554,7 +558,7 @@ class _LensProblem:
         rows = np.concatenate([rows, residuals[..., None]], axis=2)
         jacobian = np.zeros((*self.mask.shape, *rows.shape[1:]))
         jacobian[self.mask] = rows
-        jacobian = jacobian.reshape(len(jacobian), -1, rows.shape[2])
+        jacobian = jacobian.reshape(len(self.mask), 2 * self.mask.shape[1], rows.shape[2])
         return np.asarray(jacobian.transpose(0, 2, 1) @ jacobian)
 
 

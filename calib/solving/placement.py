@@ -22,9 +22,9 @@ from hybridve.calib.pose import moved_pose, turned_pose
 from hybridve.calib.solving.bundle import POSE, lens_derivatives
 from hybridve.calib.solving.least_squares import (
     FLOOR_PX,
+    Limits,
     NormalEquations,
     Step,
-    Stopping,
     minimized,
     soft_l1,
     soft_l1_weights,
@@ -182,8 +182,8 @@ def place_boards(
         Points that miss by more count less than squared (soft L1).
     """
     problem = _Placement(views, tuple(moving), tuple(zooming), scaled, loss_px)
-    stopping = Stopping(_MAX_STEPS, _COST_SHARE, views.pixels.size * FLOOR_PX**2)
-    return minimized(problem, problem.projected(start), stopping).state.placed
+    limits = Limits(_MAX_STEPS, _COST_SHARE, views.pixels.size * FLOOR_PX**2)
+    return minimized(problem, problem.projected(start), limits).state.placed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
