@@ -1,7 +1,8 @@
-"""Rigid transforms as (3, 4) float64 matrices ``[R | t]``.
+"""Rotations, and rigid transforms as (3, 4) float64 matrices ``[R | t]``.
 
 ``b_from_a`` maps coordinates in frame a to frame b: ``x_b = R @ x_a + t``, so that in
-``a_from_b`` after ``b_from_c`` the inner names meet. Translations are metres.
+``a_from_b`` after ``b_from_c`` the inner names meet. Translations are metres. A rotation's vector
+is its axis times its angle in radians.
 """
 
 import numpy as np
@@ -36,6 +37,61 @@ def placed(vertices_a: NDArray[np.float64], b_from_a: Pose) -> NDArray[np.float6
     """
     rotation = np.ascontiguousarray(b_from_a[:, :3])
     return np.asarray(np.einsum("ij,kj->ik", vertices_a, rotation) + b_from_a[:, 3])
+
+
+def cross_matrix(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    matrix = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    return np.moveaxis(matrix, (0, 1), (-2, -1))
+
+
+def rotation_of(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations (..., 3, 3) of rotation vectors (..., 3), exact at every angle."""
+    # Late, here and below: most commands turn nothing, and need not wait for SciPy.
+    from scipy.spatial.transform import Rotation
+
+    found = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return np.asarray(found, np.float64).reshape(*vectors.shape, 3)
+
+
+def rotation_vector(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vectors (..., 3) of rotations (..., 3, 3), exact at every angle.
+
+    OpenCV's takes angles below 1e-5 for none, which is a pixel's hundredth, and loses digits near a
+    half turn.
+    """
+    from scipy.spatial.transform import Rotation
+
+    found = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(found, np.float64).reshape(rotations.shape[:-1])
+
+
+def nearest_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations nearest to matrices (..., 3, 3), also to such as mirror."""
+    u, _, vt = np.linalg.svd(matrices)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
+
+
+def moved_pose(poses: NDArray[np.float64], changes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return poses (..., 3, 4) moved by changes (..., 6), (omega, v), in the frame they lead to.
+
+    To first order ``x + omega x x + v``; the rotation is exact, and freed of rounding.
+    """
+    turns = rotation_of(changes[..., :3])
+    shifted = (turns @ poses[..., 3:]) + changes[..., 3:, None]
+    return np.concatenate([nearest_rotation(turns @ poses[..., :3]), shifted], axis=-1)
+
+
+def turned_pose(poses: NDArray[np.float64], changes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return poses (..., 3, 4) turned about their own origins, then shifted: (omega, v), (..., 6).
+
+    As `moved_pose`, but a frame far from what stands in it loses nothing.
+    """
+    turned = nearest_rotation(rotation_of(changes[..., :3]) @ poses[..., :3])
+    return np.concatenate([turned, poses[..., 3:] + changes[..., 3:, None]], axis=-1)
 
 
 def rotation_about_axes(rotate_deg: tuple[float, float, float]) -> NDArray[np.float64]:

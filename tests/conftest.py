@@ -38,6 +38,11 @@ settings.load_profile("same")
 # so no source is read.
 providers.is_local_module_file = lambda path: False  # type: ignore[assignment]
 
+# Compiled code is the user's own: it takes long, and is named after its sources. numba looks where
+# to keep it when it is loaded, before there is any fixture.
+if (_compiled := cache_folder("compiled")) is not None:
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(_compiled))
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Benchmarks run at their smallest unless they are asked for what is published."""
@@ -72,12 +77,8 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep what tests keep away from the user's, for the session, as fixtures keep things too.
 
     Processes side by side share it: corners that one has found spare the others the search.
-    Compiled code is the user's own: it takes long, and is named after its sources.
     """
     with pytest.MonkeyPatch.context() as patch:
-        compiled = cache_folder("compiled")
-        if compiled is not None and "NUMBA_CACHE_DIR" not in os.environ:
-            patch.setenv("NUMBA_CACHE_DIR", str(compiled))
         mine = tmp_path_factory.getbasetemp()
         of_all = mine.parent if "PYTEST_XDIST_WORKER" in os.environ else mine
         patch.setenv("HYBRIDVE_CACHE", str(of_all / "cache"))

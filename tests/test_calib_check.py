@@ -19,9 +19,9 @@ from hybridve.calib.judging.case import SIGNIFICANCE
 from hybridve.calib.judging.check import check_rig
 from hybridve.calib.judging.comparison import chance_of
 from hybridve.calib.judging.wording import SCALE_TOLERANCE
-from hybridve.calib.pose import compose, rotation_about_axes
+from hybridve.calib.pose import compose, moved_pose, rotation_about_axes
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.bundle import adjust, moved_pose
+from hybridve.calib.solving.bundle import adjust
 from hybridve.calib.solving.covariance import rig_covariance
 from hybridve.calib.solving.noise import measure_noise
 from hybridve.calib.solving.placement import zoomed

@@ -15,9 +15,9 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, project_points
 from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings
-from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.pose import Pose, compose, invert, moved_pose
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.bundle import Adjusted, adjust, moved_pose
+from hybridve.calib.solving.bundle import Adjusted, adjust
 from hybridve.calib.solving.covariance import rig_covariance
 from hybridve.calib.solving.errors_in_space import (
     parameter_slices,

@@ -11,8 +11,7 @@ from hybridve.calib.boards.board import Observations, Sighting
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.judging.check import check_rig
-from hybridve.calib.pose import compose
-from hybridve.calib.solving.bundle import moved_pose
+from hybridve.calib.pose import compose, moved_pose
 from hybridve.calib.verdict import RigCheck
 
 SYMMETRIC, QUARTERS = BOARDS[0], BOARDS[3]

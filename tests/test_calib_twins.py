@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.judging.twins import find_twins, twins_text
+from hybridve.calib.pose import moved_pose
 from hybridve.calib.rig import Mount, Rig
-from hybridve.calib.solving.bundle import moved_pose
 
 BOARD = Chessboard(7, 6, 0.1)
 RING = ring(BOARD, ["OPENCV", "PINHOLE", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])

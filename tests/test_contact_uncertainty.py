@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.stats import binom, norm
 
 from hybridve.calib.camera import Camera
+from hybridve.calib.pose import moved_pose
 from hybridve.calib.rig import Rig, RigCovariance
-from hybridve.calib.solving.bundle import moved_pose
 from hybridve.calib.verdict import RigTest
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.cones import metres_per_pixel

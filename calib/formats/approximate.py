@@ -17,20 +17,14 @@ from hybridve.calib.lens import cam_from_img, img_from_cam
 _FIT_STEPS = 20
 _CHECK_STEPS = 55
 
+#: A lens that shows fewer rays of the grid than this shows nothing: they would not fix another.
+_LEAST_RAYS = 8
+
 #: A pixel shows a ray only if that ray leads back to the pixel, this near.
 _FOLD_TOLERANCE_PX = 1e-3
 
-#: Rounds of the damped least squares, and when they end: relative gain of the sum of squares, or
-#: an error that nobody can see.
-_ROUNDS = 100
-_ENOUGH_GAIN = 1e-5
-_ENOUGH_PX = 1e-6
-
 #: Further off than this, or not a number, a lens does not serve.
 _FAR_PX = 1e6
-
-#: Relative step of the derivatives.
-_STEP = 1e-6
 
 
 def approximate(camera: Camera, models: Sequence[tuple[str, int]]) -> tuple[Camera, float]:
@@ -84,7 +78,7 @@ def _shown(camera: Camera, steps: int) -> tuple[NDArray[np.float64], NDArray[np.
     again = np.full_like(grid, np.inf)
     again[exists] = img_from_cam(camera, rays[exists])
     exists &= (np.abs(again - grid) < _FOLD_TOLERANCE_PX).all(axis=1)  # NaN is not
-    if not exists.any():
+    if np.count_nonzero(exists) < _LEAST_RAYS:
         raise CalibrationError(f"camera {camera.name!r}: its lens shows nothing anywhere")
     return rays[exists], grid[exists]
 
@@ -108,33 +102,10 @@ def _fit(
         found = np.nan_to_num(img_from_cam(with_free(free), rays) - pixels, nan=_FAR_PX)
         return np.clip(found, -_FAR_PX, _FAR_PX).ravel()
 
-    free = np.zeros(n_free)
-    free[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    errors = residuals(free)
-    damping = 1e-3
-    for _ in range(_ROUNDS):
-        steps = _STEP * np.maximum(np.abs(free), 1.0)
-        jacobian = np.stack(
-            [
-                (residuals(free + step) - residuals(free - step)) / (2.0 * step.max())
-                for step in np.diag(steps)
-            ],
-            axis=1,
-        )
-        # Marquardt's scaling: pixels and coefficients differ by many orders of magnitude.
-        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
-        damped = np.vstack([jacobian / scale, np.sqrt(damping) * np.eye(n_free)])
-        target = np.concatenate([-errors, np.zeros(n_free)])
-        step = np.linalg.lstsq(damped, target, rcond=None)[0] / scale
-        tried = residuals(free + step)
-        gain = float(errors @ errors - tried @ tried)
-        if gain > 0:
-            is_enough = gain < _ENOUGH_GAIN * float(errors @ errors)
-            free, errors, damping = free + step, tried, damping / 5.0
-            if is_enough or np.abs(errors).max() < _ENOUGH_PX:
-                break
-        elif damping > 1e12:
-            break
-        else:
-            damping *= 5.0
-    return with_free(free)
+    # Late: most rigs need no other lens, and their readers need not wait for SciPy's optimisers.
+    from scipy.optimize import least_squares
+
+    start = np.zeros(n_free)
+    start[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    # Scaled by the derivatives: pixels and coefficients differ by many orders of magnitude.
+    return with_free(least_squares(residuals, start, method="lm", x_scale="jac").x)

@@ -31,9 +31,9 @@ from hybridve.calib.formats.foreign import (
     ForeignRig,
     as_size,
     read_text,
-    rotation_vector,
     translation_in,
 )
+from hybridve.calib.pose import rotation_vector
 
 #: Coefficients of the polynomial lens that both programs unpack.
 _N_COEFFICIENTS = 5

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.pose import Pose
+from hybridve.calib.pose import Pose, nearest_rotation, rotation_of
 
 #: A rotation with this error (largest entry of RR'-I) was rounded; beyond it, it is none.
 _ROUNDED_ROTATION = 1e-3
@@ -143,45 +142,15 @@ def as_pose(rotation: Any, translation: Any, where: str) -> Pose:
     if vector.size != 3:
         raise CalibrationError(f"{where}: translation of shape {vector.shape}, expected 3 numbers")
     if matrix.size == 3:
-        matrix = np.asarray(cv2.Rodrigues(matrix.ravel())[0], dtype=np.float64)
+        matrix = rotation_of(matrix.ravel())
     if matrix.shape != (3, 3):
         raise CalibrationError(
             f"{where}: rotation of shape {matrix.shape}, expected 3 numbers or (3, 3)"
         )
-    return np.column_stack([nearest_rotation(matrix, where), vector.ravel()])
+    return np.column_stack([as_rotation(matrix, where), vector.ravel()])
 
 
-def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Rodrigues vector (3,) of a rotation (3, 3), exact at every angle.
-
-    OpenCV's takes angles below 1e-5 for none, which is a pixel's hundredth, and loses digits near a
-    half turn; so it goes by the quaternion, from its largest part.
-
-    References
-    ----------
-    Shepperd, Quaternion from rotation matrix, Journal of Guidance and Control 1(3), 1978.
-    """
-    trace = float(np.trace(rotation))
-    # Four times the products of the quaternion's parts (w, x, y, z) with each other.
-    products = np.zeros((4, 4))
-    products[0, 0] = 1.0 + trace
-    products[1:, 1:] = rotation + rotation.T + (1.0 - trace) * np.eye(3)
-    antisymmetric = rotation - rotation.T
-    products[0, 1:] = products[1:, 0] = (
-        antisymmetric[2, 1],
-        antisymmetric[0, 2],
-        antisymmetric[1, 0],
-    )
-    quaternion = products[int(np.argmax(np.diag(products)))]
-    quaternion = quaternion * np.copysign(1.0, quaternion[0])
-    length = float(np.linalg.norm(quaternion[1:]))
-    if length == 0:
-        return np.zeros(3)
-    angle = 2.0 * np.arctan2(length, quaternion[0])
-    return np.asarray(angle / length * quaternion[1:])
-
-
-def nearest_rotation(matrix: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+def as_rotation(matrix: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     """Return a (3, 3) rotation freed of rounding.
 
     Raises
@@ -200,8 +169,7 @@ def nearest_rotation(matrix: NDArray[np.float64], where: str) -> NDArray[np.floa
             f"{where}: the rotation is none (R R' is off by {error:.0e}); check the order of its "
             "entries"
         )
-    u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ vt)
+    return nearest_rotation(matrix)
 
 
 def translation_in(camera: Camera, unit_m: float) -> list[float]:

@@ -25,9 +25,9 @@ from hybridve.calib.formats import opencv_lens
 from hybridve.calib.formats.foreign import (
     ForeignCamera,
     ForeignRig,
-    rotation_vector,
     translation_in,
 )
+from hybridve.calib.pose import rotation_vector
 
 #: How files of OpenCV's kind spell what they hold, in lower case without "_", "-" and blanks.
 _KEYS = {

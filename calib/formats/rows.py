@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.foreign import ForeignCamera, ForeignRig, nearest_rotation, read_text
+from hybridve.calib.formats.foreign import ForeignCamera, ForeignRig, as_rotation, read_text
 
 #: A skew below this comes from the decomposition's own rounding.
 _NO_SKEW_PX = 1e-9
@@ -79,7 +79,7 @@ def read_rows(path: Path) -> ForeignRig:
         if len(numbers) == 12:
             img_from_world = numbers.reshape(3, 4)
         else:
-            rotation = nearest_rotation(numbers[9:18].reshape(3, 3), where)
+            rotation = as_rotation(numbers[9:18].reshape(3, 3), where)
             matrix = numbers[:9].reshape(3, 3)
             if matrix[2, 2] > 0 and np.linalg.det(matrix) < 0:
                 raise CalibrationError(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.pose import Pose
+from hybridve.calib.pose import Pose, nearest_rotation
 
 #: A quaternion's length, and a matrix's R R^T, may be this far from 1: rounded, not damaged.
 _ROUNDED = 1e-3
@@ -131,5 +131,4 @@ def _from_matrix(matrix: NDArray[np.float64], where: str) -> Pose:
             f"{where}: the matrix is not a rotation and a translation (error {error:.1g}); "
             "expected m11..m14 to be its first row"
         )
-    left, _, right = np.linalg.svd(rotation)
-    return np.column_stack([left @ right, matrix[:, 3]])
+    return np.column_stack([nearest_rotation(rotation), matrix[:, 3]])

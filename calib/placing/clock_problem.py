@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,15 +11,19 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img
 from hybridve.calib.placing.board_tracks import Tracks, interpolated
 from hybridve.calib.placing.clock_start import MIN_COMMON, Start
-from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.pose import Pose, compose, invert, moved_pose
 from hybridve.calib.solving.consensus import pose_distances
+from hybridve.calib.solving.least_squares import Limits, NormalEquations, Step, minimized
 
 #: Instants adjusted together at most.
 _MAX_INSTANTS = 80
 
-#: Steps of the adjustment; it has converged when no offset moves further (frames).
-_MAX_STEPS = 30
-_CONVERGED_FRAMES = 1e-8
+#: Steps of the adjustment, and the share of the cost that the last one gains.
+_MAX_STEPS = 60
+_COST_SHARE = 1e-13
+
+#: A step moves an offset by so many frames at most.
+_LARGEST_CHANGE = 0.5
 
 #: Residuals beyond this many robust standard deviations weigh less than squared.
 _LOSS_SIGMAS = 3.0
@@ -51,8 +54,11 @@ class _Found:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sampled:
-    """All views at given offsets: residuals (V, N, 2) px and their slopes; 0 where not seen."""
+    """Offsets, poses, and all views there: residuals (V, N, 2) px and slopes; 0 where not seen."""
 
+    offsets: NDArray[np.float64]
+    cam_from_rig: NDArray[np.float64]
+    rig_from_board: NDArray[np.float64]
     residuals: NDArray[np.float64]
     by_point: NDArray[np.float64]
     points_cam: NDArray[np.float64]
@@ -157,30 +163,13 @@ class ClockProblem:
         return cls(points, focal_px, rays, views, start, np.array(rig_from_board), spacing)
 
     def solve(self) -> _Found:
-        """Fit everything by Levenberg and Marquardt's method, robustly."""
-        damping = 1e-4
-        sampled = self._sample(self.offsets, self.cam_from_rig, self.rig_from_board)
-        for _ in range(_MAX_STEPS):
-            weights, limit = self._weights(sampled)
-            normal, right, back = self._normal_equations(sampled, weights)
-            cost = self._cost(sampled, limit)
-            moved = 0.0
-            while damping < 1e8:
-                damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
-                step = np.asarray(np.linalg.solve(damped, right), np.float64)
-                trial = self._moved(step, back(step))
-                trial_sampled = self._sample(*trial)
-                if self._cost(trial_sampled, limit) <= cost:
-                    moved = float(np.abs(trial[0] - self.offsets).max())
-                    self.offsets, self.cam_from_rig, self.rig_from_board = trial
-                    sampled = trial_sampled
-                    damping = max(0.1 * damping, 1e-12)
-                    break
-                damping *= 10.0
-            if moved < _CONVERGED_FRAMES:
-                break
-        weights, _ = self._weights(sampled)
-        normal, _, back = self._normal_equations(sampled, weights)
+        """Fit everything, robustly."""
+        sampled = self.sampled(self.offsets, self.cam_from_rig, self.rig_from_board)
+        limits = Limits(_MAX_STEPS, _COST_SHARE)
+        sampled = minimized(self._robust(sampled), sampled, limits, self._robust).state
+        weights = _weights(sampled, _outlier_px(sampled))
+        reduced = self.normal_equations(sampled, weights).reduced()
+        normal = reduced.information
         # Interpolation smooths noise: that of the frames themselves is what is sought.
         n_points = int(sampled.seen.sum())
         n_seen_poses = len(np.unique(self.poses[sampled.seen.any(axis=1)]))
@@ -193,20 +182,20 @@ class ClockProblem:
         # residuals are smallest, which pulls the offset there. Both are expected values, and are
         # taken off.
         of_noise = 2.0 * share_left * variance * (weights * sampled.seen).sum(axis=1)
-        pull, false_motion = np.zeros((2, len(self.offsets), 7))
+        pull, false_motion = np.zeros((2, len(sampled.offsets), 7))
         np.add.at(pull[:, 6], self.cameras, of_noise * sampled.common_noise)
         np.add.at(false_motion[:, 6], self.cameras, of_noise * sampled.speed_noise)
         scale = np.sqrt(np.diag(normal)) + 1e-12
         true_normal = normal - np.diag(false_motion[1:].ravel())
         inverse = np.linalg.pinv(true_normal / np.outer(scale, scale), hermitian=True)
         inverse /= np.outer(scale, scale)
-        offsets = self.offsets.copy()
+        offsets = sampled.offsets.copy()
         offsets[1:] -= (inverse @ pull[1:].ravel()).reshape(-1, 7)[:, 6]
-        scatter = self._scatter(sampled, weights, back)
+        scatter = self._scatter(sampled, weights, reduced.back)
         covariance = variance * inverse @ scatter @ inverse
-        stds = np.zeros(len(self.offsets))
-        motion, telling = np.ones((2, len(self.offsets)))
-        for camera in range(1, len(self.offsets)):
+        stds = np.zeros(len(offsets))
+        motion, telling = np.ones((2, len(offsets)))
+        for camera in range(1, len(offsets)):
             column = 7 * (camera - 1) + 6
             stds[camera] = np.sqrt(max(float(covariance[column, column]), 0.0))
             false, power = false_motion[camera, 6], float(normal[column, column])
@@ -216,15 +205,19 @@ class ClockProblem:
         total = float((sampled.residuals**2).sum()) / max(n_points, 1)
         return _Found(offsets, stds, motion, telling, float(np.sqrt(total)))
 
+    def _robust(self, sampled: _Sampled) -> "_Robust":
+        """Return the problem with outliers as the residuals tell them."""
+        return _Robust(self, _outlier_px(sampled))
+
     def _scatter(
-        self, sampled: _Sampled, weights: NDArray[np.float64], back: "_Back"
+        self, sampled: _Sampled, weights: NDArray[np.float64], back: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the covariance of the right-hand side for noise of variance 1 in the frames.
 
         Neighbouring instants are interpolated from the same frames, and share their noise: it is
         summed up frame by frame.
         """
-        size = len(back.solved[0, 0])
+        size = back.shape[2]
         camera_part, board_part = self._slopes(sampled)
         scatter = np.zeros((size, size))
         for camera in np.unique(self.cameras):
@@ -232,11 +225,11 @@ class ClockProblem:
             for row in np.flatnonzero(self.cameras == camera).tolist():
                 _, pose, board, instant, listing = self.views[row]
                 track = interpolated(
-                    self.rays[camera], board, instant - self.offsets[camera], self.spacing
+                    self.rays[camera], board, instant - sampled.offsets[camera], self.spacing
                 )
                 if track is None:
                     continue
-                slopes = -board_part[row] @ back.solved[pose]  # (N, 2, size)
+                slopes = -board_part[row] @ back[pose]  # (N, 2, size)
                 if camera > 0:
                     slopes[..., 7 * (camera - 1) : 7 * camera] += camera_part[row]
                 unlisted = np.zeros_like(slopes)
@@ -249,12 +242,13 @@ class ClockProblem:
                 scatter += flat.T @ flat
         return scatter
 
-    def _sample(
+    def sampled(
         self,
         offsets: NDArray[np.float64],
         cam_from_rig: NDArray[np.float64],
         rig_from_board: NDArray[np.float64],
     ) -> _Sampled:
+        """Return all views at offsets, and with cameras and boards at poses."""
         n_views, n_points = self.board_points.shape[:2]
         tracked, speed = np.full((2, n_views, n_points, 2), np.nan)
         noise, speed_noise, common_noise = np.ones(n_views), np.zeros(n_views), np.zeros(n_views)
@@ -287,104 +281,108 @@ class ClockProblem:
         by_point = np.where(seen[:, :, None, None], focal[..., None] * by_point, 0.0)
         speed = np.where(seen[:, :, None], focal * speed, 0.0)
         return _Sampled(
-            residuals, by_point, points_cam, speed, noise, speed_noise, common_noise, seen
+            offsets,
+            cam_from_rig,
+            rig_from_board,
+            residuals,
+            by_point,
+            points_cam,
+            speed,
+            noise,
+            speed_noise,
+            common_noise,
+            seen,
         )
 
-    def _weights(self, sampled: _Sampled) -> tuple[NDArray[np.float64], float]:
-        """Return the weights (V, N) of Huber's loss, and where it leaves the square."""
-        misses = np.linalg.norm(sampled.residuals, axis=2)
-        sigma = 0.85 * float(np.median(misses[sampled.seen]))  # of a two-dimensional error
-        limit = max(_LOSS_SIGMAS * sigma, 1e-9)
-        return np.where(misses <= limit, 1.0, limit / np.maximum(misses, limit)), limit
+    def normal_equations(self, sampled: _Sampled, weights: NDArray[np.float64]) -> NormalEquations:
+        """Return those of cameras and offsets, which are shared, and of the boards' poses.
 
-    @staticmethod
-    def _cost(sampled: _Sampled, limit: float) -> float:
-        misses = np.linalg.norm(sampled.residuals, axis=2)[sampled.seen]
-        if not len(misses):
-            return np.inf
-        loss = np.where(misses <= limit, misses**2, 2.0 * limit * misses - limit**2)
-        return float(loss.mean())  # the mean: as offsets move, corners come and go
-
-    def _normal_equations(
-        self, sampled: _Sampled, weights: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], "_Back"]:
-        """Return the equations of cameras and offsets, the boards' poses eliminated."""
-        n_cameras, n_poses = len(self.offsets), len(self.rig_from_board)
+        The reference holds the rig's frame and the session's clock.
+        """
+        n_cameras, n_poses = len(sampled.offsets), len(sampled.rig_from_board)
         camera_part, board_part = self._slopes(sampled)
         weighted = weights[..., None, None] * camera_part
         cc = np.einsum("vnki,vnkj->vij", weighted, camera_part)
-        cb = np.einsum("vnki,vnkj->vij", weighted, board_part)
+        bc = np.einsum("vnki,vnkj->vij", board_part, weighted)
         bb = np.einsum("vnki,vnkj,vn->vij", board_part, board_part, weights)
         rc = np.einsum("vnki,vnk->vi", weighted, sampled.residuals)
         rb = np.einsum("vnki,vnk,vn->vi", board_part, sampled.residuals, weights)
-        normal = np.zeros((n_cameras, 7, n_cameras, 7))
-        right = np.zeros((n_cameras, 7))
-        across = np.zeros((n_poses, n_cameras, 7, 6))
+        shared, right = np.zeros((n_cameras, 7, n_cameras, 7)), np.zeros((n_cameras, 7))
+        mixed = np.zeros((n_poses, n_cameras, 6, 7))
         boards, right_boards = np.zeros((n_poses, 6, 6)), np.zeros((n_poses, 6))
         for camera in range(n_cameras):
-            normal[camera, :, camera] = cc[self.cameras == camera].sum(axis=0)
+            shared[camera, :, camera] = cc[self.cameras == camera].sum(axis=0)
         np.add.at(right, self.cameras, rc)
-        np.add.at(across, (self.poses, self.cameras), cb)
+        np.add.at(mixed, (self.poses, self.cameras), bc)
         np.add.at(boards, self.poses, bb)
         np.add.at(right_boards, self.poses, rb)
+        # Of some boards hardly a corner is seen.
         boards += 1e-9 * np.eye(6) * (1.0 + np.trace(boards, axis1=1, axis2=2))[:, None, None]
-        # The reference holds the rig's frame and the session's clock.
-        flat = across[:, 1:].reshape(n_poses, -1, 6)
-        size = flat.shape[1]
-        solved = np.asarray(
-            np.linalg.solve(boards, flat.swapaxes(1, 2)), np.float64
-        )  # (P, 6, size)
-        whole = normal[1:, :, 1:].reshape(size, size) - np.einsum("pia,paj->ij", flat, solved)
-        solved_right = np.asarray(np.linalg.solve(boards, right_boards[..., None]), np.float64)[
-            ..., 0
-        ]
-        reduced = right[1:].ravel() - np.einsum("pia,pa->i", flat, solved_right)
-        return whole, reduced, _Back(solved, solved_right)
+        size = 7 * (n_cameras - 1)
+        return NormalEquations(
+            shared[1:, :, 1:].reshape(size, size),
+            right[1:].ravel(),
+            boards,
+            right_boards,
+            mixed[:, 1:].transpose(0, 2, 1, 3).reshape(n_poses, 6, size),
+        )
 
     def _slopes(self, sampled: _Sampled) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return by what residuals fall: camera and offset (V, N, 2, 7), board (V, N, 2, 6)."""
         camera_part = np.zeros((*sampled.residuals.shape, 7))
         camera_part[..., :6] = _by_motion(sampled.by_point, sampled.points_cam)
         camera_part[..., 6] = sampled.speed
-        seeing = self.cam_from_rig[self.cameras]
+        seeing = sampled.cam_from_rig[self.cameras]
         points_rig = (sampled.points_cam - seeing[:, None, :, 3]) @ seeing[:, :, :3]
         return camera_part, _by_motion(sampled.by_point @ seeing[:, None, :, :3], points_rig)
 
-    def _moved(
-        self, step: NDArray[np.float64], board_steps: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        steps = step.reshape(-1, 7)
-        offsets = self.offsets.copy()
-        offsets[1:] += np.clip(steps[:, 6], -0.5, 0.5)
-        cam_from_rig = self.cam_from_rig.copy()
-        for camera, motion in enumerate(steps[:, :6], start=1):
-            cam_from_rig[camera] = _nudged(cam_from_rig[camera], motion)
-        placed = np.stack(
-            [_nudged(*pair) for pair in zip(self.rig_from_board, board_steps, strict=True)]
-        )
-        return offsets, cam_from_rig, placed
+
+def _outlier_px(sampled: _Sampled) -> float:
+    """Return beyond which length a residual counts less than squared, pixels."""
+    misses = np.linalg.norm(sampled.residuals, axis=2)
+    sigma = 0.85 * float(np.median(misses[sampled.seen]))  # of a two-dimensional error
+    return max(_LOSS_SIGMAS * sigma, 1e-9)
+
+
+def _weights(sampled: _Sampled, limit_px: float) -> NDArray[np.float64]:
+    """Return the weights (V, N) of Huber's loss."""
+    misses = np.linalg.norm(sampled.residuals, axis=2)
+    return np.where(misses <= limit_px, 1.0, limit_px / np.maximum(misses, limit_px))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Back:
-    """How the boards' poses follow from the rest."""
+class _Robust:
+    """What least squares need, with Huber's loss."""
 
-    solved: NDArray[np.float64]
-    solved_right: NDArray[np.float64]
+    clocks: ClockProblem
+    limit_px: float
 
-    def __call__(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(self.solved_right - self.solved @ step)
+    def cost(self, state: _Sampled) -> float:
+        misses = np.linalg.norm(state.residuals, axis=2)[state.seen]
+        if not len(misses):
+            return np.inf
+        limit = self.limit_px
+        loss = np.where(misses <= limit, misses**2, 2.0 * limit * misses - limit**2)
+        # By the mean: as offsets move, corners come and go.
+        return float(loss.mean()) * state.seen.size
+
+    def normal_equations(self, state: _Sampled) -> NormalEquations:
+        return self.clocks.normal_equations(state, _weights(state, self.limit_px))
+
+    def moved(self, state: _Sampled, step: Step) -> _Sampled:
+        steps = step.shared.reshape(-1, 7)
+        offsets, cam_from_rig = state.offsets.copy(), state.cam_from_rig.copy()
+        offsets[1:] += np.clip(steps[:, 6], -_LARGEST_CHANGE, _LARGEST_CHANGE)
+        cam_from_rig[1:] = moved_pose(cam_from_rig[1:], steps[:, :6])
+        return self.clocks.sampled(
+            offsets, cam_from_rig, moved_pose(state.rig_from_board, step.blocks)
+        )
 
 
 def _by_motion(by_point: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return slopes (V, N, 2, 6) by turn and shift from those by points (V, N, 2, 3)."""
     turn = np.cross(points[:, :, None, :], by_point)
     return np.concatenate([turn, by_point], axis=3)
-
-
-def _nudged(pose: Pose, motion: NDArray[np.float64]) -> Pose:
-    turn = np.asarray(cv2.Rodrigues(motion[:3])[0], np.float64)
-    return np.column_stack([turn @ pose[:, :3], turn @ pose[:, 3] + motion[3:]])
 
 
 def _rays(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,7 +16,8 @@ _CLICK_SHARE = 0.01
 #: Rays that meet at a smaller angle (radians) tell no distance.
 _MIN_ANGLE_RAD = 5e-3
 
-_TRIANGULATION_STEPS = 10
+#: Where least squares end: rounding.
+_ROUNDING = 1e-15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,21 +75,34 @@ def triangulate(
     spread = np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=2)
     if spread.max() < _MIN_ANGLE_RAD:
         return nowhere
+    # Late: most commands triangulate nothing, and need not wait for SciPy's optimisers.
+    from scipy.optimize import least_squares
+
+    def points_cam(point: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(poses[:, :, :3] @ point + poses[:, :, 3])
+
+    def misses(point: NDArray[np.float64]) -> NDArray[np.float64]:
+        seen = points_cam(point)
+        return np.asarray(focal_px[:, None] * (seen[:, :2] / seen[:, 2:] - rays)).ravel()
+
+    def slopes(point: NDArray[np.float64]) -> NDArray[np.float64]:
+        seen = points_cam(point)[:, :, None]
+        flat = seen[:, :2] / seen[:, 2:]
+        by_point = (poses[:, :2, :3] - flat * poses[:, 2:, :3]) / seen[:, 2:]
+        return np.asarray(focal_px[:, None, None] * by_point).reshape(-1, 3)
+
     # Start where the rays pass nearest to one another, in space.
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     centers = np.array([camera.center_world for camera in cameras])
-    point = np.linalg.solve(across.sum(axis=0), np.einsum("cij,cj->i", across, centers))
-    residuals = np.zeros((len(cameras), 2))
-    for _ in range(_TRIANGULATION_STEPS):
-        points_cam = poses[:, :, :3] @ point + poses[:, :, 3]
-        if (points_cam[:, 2] <= 0).any():
-            return nowhere
-        flat = points_cam[:, :2] / points_cam[:, 2:]
-        residuals = focal_px[:, None] * (rays - flat)
-        slopes = (poses[:, :2, :3] - flat[:, :, None] * poses[:, 2:, :3]) / points_cam[:, 2:, None]
-        jacobian = (focal_px[:, None, None] * slopes).reshape(-1, 3)
-        point = point + np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
-    return np.asarray(point), np.linalg.norm(residuals, axis=1)
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    start = np.linalg.solve(across.sum(axis=0), np.einsum("cij,cj->i", across, centers))
+    if (points_cam(start)[:, 2] <= 0).any():
+        return nowhere
+    found = least_squares(
+        misses, start, slopes, method="lm", ftol=_ROUNDING, xtol=_ROUNDING, gtol=_ROUNDING
+    )
+    if (points_cam(found.x)[:, 2] <= 0).any():
+        return nowhere
+    return found.x, np.linalg.norm(found.fun.reshape(-1, 2), axis=1)
 
 
 def triangulated(

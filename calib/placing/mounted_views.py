@@ -3,14 +3,20 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Sighting
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.pose import Pose, angle_between, compose, invert
+from hybridve.calib.pose import (
+    Pose,
+    angle_between,
+    compose,
+    invert,
+    nearest_rotation,
+    rotation_vector,
+)
 from hybridve.calib.solving.lens_fit import locate_board
 
 Floats = NDArray[np.float64]
@@ -170,7 +176,7 @@ def check_motion(
         )
     rotations = np.array(list(poses.values()))[:, :, :3]
     mean = nearest_rotation(rotations.sum(axis=0))
-    turns = np.array([cv2.Rodrigues(mean.T @ rotation)[0].ravel() for rotation in rotations])
+    turns = rotation_vector(mean.T @ rotations)
     _, spread, axes = np.linalg.svd(np.rad2deg(turns), full_matrices=False)
     turn_deg = [float(value) for value in spread / np.sqrt(len(turns))]
     if turn_deg[0] < _LEAST_TURN_DEG:
@@ -198,10 +204,3 @@ def wrong_unit(camera: Camera, scale: float) -> CalibrationError:
         f"camera {camera.name!r}: the lengths of its tracked poses have to be multiplied by "
         f"{scale:.4g} to fit the board, expected 1: poses are in metres; {found}"
     )
-
-
-def nearest_rotation(matrix: Floats) -> Floats:
-    """Return the rotation that is nearest to a matrix (3, 3)."""
-    left, _, right = np.linalg.svd(matrix)
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return np.asarray(left @ flip @ right)

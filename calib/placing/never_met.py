@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.placing.looks import DISAGREE
-from hybridve.calib.pose import Pose, compose
+from hybridve.calib.pose import Pose, compose, nearest_rotation
 from hybridve.calib.solving.consensus import pose_distances
 
 #: Moments from which the poses of cameras and boards that never meet are found, at least; how far
@@ -79,7 +79,7 @@ def _solve_joint_of_all(
         return None
     z, w = u[:, 0].reshape(3, 3), vt[0].reshape(3, 3)
     sign = np.sign(np.linalg.det(z))
-    rotation_z, rotation_w = _nearest_rotation(sign * z), _nearest_rotation(sign * w)
+    rotation_z, rotation_w = nearest_rotation(sign * z), nearest_rotation(sign * w)
     # t2 + R2 t_w = Z t1 + t_z
     n = len(first_from_near)
     matrix, right = np.zeros((3 * n, 6)), np.zeros(3 * n)
@@ -94,8 +94,3 @@ def _solve_joint_of_all(
         np.column_stack([rotation_z, solution[:3]]),
         np.column_stack([rotation_w, solution[3:]]),
     )
-
-
-def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)

@@ -21,7 +21,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.marks import Mark, click_warnings, rounded, triangulated
 from hybridve.calib.placing.moments import PoseKey
-from hybridve.calib.pose import Pose, compose, invert, transform
+from hybridve.calib.pose import Pose, compose, invert, nearest_rotation, transform
 from hybridve.calib.record import WorldRecord
 from hybridve.calib.solving.bundle import BundleView
 
@@ -373,9 +373,9 @@ def _rigid_fit(
 ) -> tuple[Pose, float]:
     """Return world_from_rig (with a mirror, if asked for), and the rms distance that is left."""
     middle_rig, middle_world = points_rig.mean(axis=0), points_world.mean(axis=0)
-    u, _, vt = np.linalg.svd((points_world - middle_world).T @ (points_rig - middle_rig))
-    handed = np.sign(np.linalg.det(u @ vt)) * (-1.0 if is_mirrored else 1.0)
-    rotation = u @ np.diag([1.0, 1.0, handed]) @ vt
+    hand = -1.0 if is_mirrored else 1.0
+    together = (points_world - middle_world).T @ (points_rig - middle_rig)
+    rotation = hand * nearest_rotation(hand * together)
     pose = np.column_stack([rotation, middle_world - rotation @ middle_rig])
     left = transform(pose, points_rig) - points_world
     return pose, float(np.sqrt((left**2).sum(axis=1).mean()))

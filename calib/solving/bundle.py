@@ -6,17 +6,17 @@ frame in which one body pose is held), camera; then through the lens::
     pixel = lens_c( cam_from_rig_c  rig_from_body_p  body_from_board_b  point )
 
 The lens models are COLMAP's. The poses of the bodies, of which there are hundreds, are eliminated
-(Schur complement), so that each step solves for the cameras alone; what is left of the normal
-matrix is the information that the pictures hold about the cameras, from which their covariance
-follows (`hybridve.calib.solving.covariance`). COLMAP's own adjustment has no boards mounted
-together, no lens common to several cameras of a rig, and gives no covariance of a rig.
+(`hybridve.calib.solving.least_squares`), so that each step solves for the cameras alone; what is
+left of the normal matrix is the information that the pictures hold about the cameras, from which
+their covariance follows (`hybridve.calib.solving.covariance`). COLMAP's own adjustment has no
+boards mounted together, no lens common to several cameras of a rig, and gives no covariance of a
+rig.
 
 A pose T is adjusted as exp(xi) T with xi = (omega, v) in the frame it leads to:
 ``x_true = x + omega x x + v``, radians and metres.
 
 This work is based on: Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle adjustment: a modern
-synthesis*, 2000; Nocedal and Wright, *Numerical optimization*, 2nd ed., 2006, chapter 10
-(Levenberg and Marquardt); Barfoot, *State estimation for robotics*, 2017, chapter 7 (poses).
+synthesis*, 2000; Barfoot, *State estimation for robotics*, 2017, chapter 7 (poses).
 """
 
 from collections.abc import Sequence
@@ -30,6 +30,16 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_by_params, img_from_cam
 from hybridve.calib.pose import Pose, transform
+from hybridve.calib.pose import moved_pose as moved_pose
+from hybridve.calib.solving.least_squares import (
+    FLOOR_PX,
+    Limits,
+    NormalEquations,
+    Step,
+    minimized,
+    soft_l1,
+    soft_l1_weights,
+)
 
 #: Parameters of a pose.
 POSE = 6
@@ -39,16 +49,9 @@ POSE = 6
 _COORDINATE_STEP = 1e-6
 _PARAMETER_STEP = 1e-6
 
-#: The adjustment has converged when a step changes no parameter by more than this share of its
-#: own uncertainty for one pixel of noise, or the cost by less than rounding.
-_STEP_TOLERANCE = 1e-9
-_COST_TOLERANCE = 1e-12
-_COST_FLOOR_PX = 1e-9
+#: When the adjustment has converged: what is left to gain is rounding.
+_COST_SHARE = 1e-12
 _MAX_STEPS = 100
-
-_FIRST_DAMPING = 1e-4
-_LEAST_DAMPING = 1e-13
-_MOST_DAMPING = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,41 +208,27 @@ def adjust(bundle: Bundle, loss_px: float = np.inf) -> Adjusted:
     """
     layout = make_layout(bundle)
     groups = _groups(bundle)
-    residuals = _residuals(bundle, groups)
-    n_seen = sum(map(len, residuals))
-    cost = _cost(groups, residuals, loss_px)
-    if not np.isfinite(cost):
+    start = _Projected(bundle, _residuals(bundle, groups))
+    problem = _Adjustment(layout, groups, loss_px)
+    if not np.isfinite(problem.cost(start)):
+        every = _by_view(bundle, groups, start.residuals)
         lost = next(
             view.image
-            for view, missed in zip(bundle.views, _by_view(bundle, groups, residuals), strict=True)
+            for view, missed in zip(bundle.views, every, strict=True)
             if not np.isfinite(missed[is_seen(view.pixels)]).all()
         )
         raise CalibrationError(
             f"the joint adjustment cannot start: its lens does not see the board in {lost}"
         )
-    damping = _FIRST_DAMPING
-    normal = _normal_equations(bundle, layout, groups, residuals, loss_px)
-    n_steps = 0
-    while n_steps < _MAX_STEPS and damping < _MOST_DAMPING:
-        n_steps += 1
-        step = _solve(normal, damping)
-        moved = _moved(bundle, layout, step)
-        moved_residuals = _residuals(moved, groups)
-        moved_cost = _cost(groups, moved_residuals, loss_px)
-        is_small = _largest(step, normal) < _STEP_TOLERANCE
-        if moved_cost <= cost:  # False for NaN
-            gain = cost - moved_cost
-            bundle, residuals, cost = moved, moved_residuals, moved_cost
-            damping = max(damping / 10.0, _LEAST_DAMPING)
-            normal = _normal_equations(bundle, layout, groups, residuals, loss_px)
-            if is_small or gain <= _COST_TOLERANCE * cost + n_seen * _COST_FLOOR_PX**2:
-                break
-        elif is_small:
-            break  # as good as rounding allows
-        else:
-            damping *= 10.0
+    floor = sum(map(len, start.residuals)) * FLOOR_PX**2
+    found = minimized(problem, start, Limits(_MAX_STEPS, _COST_SHARE, floor))
+    adjusted = found.state
     return Adjusted(
-        bundle, _by_view(bundle, groups, residuals), _reduced(normal, 0.0)[0], layout, n_steps
+        adjusted.bundle,
+        _by_view(adjusted.bundle, groups, adjusted.residuals),
+        problem.normal_equations(adjusted).reduced().information,
+        layout,
+        found.n_steps,
     )
 
 
@@ -252,7 +241,7 @@ def view_residuals(bundle: Bundle) -> tuple[NDArray[np.float64], ...]:
 def total_cost(bundle: Bundle, loss_px: float = np.inf) -> float:
     """Return the robust sum of squares of all residuals alike; NaN where a seen point is unseen."""
     residuals = np.concatenate(_residuals(bundle, _groups(bundle)))
-    return float(_soft((residuals**2).sum(axis=1), loss_px).sum())
+    return float(soft_l1((residuals**2).sum(axis=1), loss_px).sum())
 
 
 def even_information(bundle: Bundle) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -270,17 +259,18 @@ def even_information(bundle: Bundle) -> tuple[NDArray[np.float64], NDArray[np.fl
     """
     layout = make_layout(bundle)
 
-    def normal(power: int) -> _Normal:
+    def normal(power: int) -> NormalEquations:
         views = tuple(replace(view, sigma_px=view.sigma_px**power) for view in bundle.views)
-        weighed = replace(bundle, views=views)
-        groups = _groups(weighed)
-        return _normal_equations(weighed, layout, groups, _residuals(weighed, groups), np.inf)
+        groups = _groups(replace(bundle, views=views))
+        start = _Projected(bundle, _residuals(bundle, groups))
+        return _Adjustment(layout, groups, np.inf).normal_equations(start)
 
     even, noisy = normal(0), normal(-1)  # a view counts by the inverse of what it says
-    information, _, back, _ = _reduced(even, 0.0)
+    reduced = even.reduced()
+    information, back = reduced.information, reduced.back
     crossed = np.einsum("fia,fib->ab", back, noisy.mixed, optimize=True)
-    of_poses = np.einsum("fia,fij,fjb->ab", back, noisy.poses, back, optimize=True)
-    spread = noisy.rest - crossed - crossed.T + of_poses
+    of_poses = np.einsum("fia,fij,fjb->ab", back, noisy.blocks, back, optimize=True)
+    spread = noisy.shared - crossed - crossed.T + of_poses
     return information, (spread + spread.T) / 2.0
 
 
@@ -365,74 +355,71 @@ def _residuals(bundle: Bundle, groups: Sequence[_Group]) -> list[NDArray[np.floa
     ]
 
 
-def _cost(
-    groups: Sequence[_Group], residuals: Sequence[NDArray[np.float64]], loss_px: float
-) -> float:
-    """Return the robust sum of squares, weighed; NaN where a seen point has no image."""
-    squares = _soft((np.concatenate(residuals) ** 2).sum(axis=1), loss_px)
-    return float(np.concatenate([group.sigma_px**-2.0 for group in groups]) @ squares)
-
-
-def _soft(squares: NDArray[np.float64], loss_px: float) -> NDArray[np.float64]:
-    """Return squared lengths, pixels squared, as they count: soft L1."""
-    if not np.isfinite(loss_px):
-        return squares
-    return 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
-
-
 # --- One step ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Normal:
-    """The normal equations: cameras, lenses and boards (A columns), and poses (F of 6)."""
+class _Projected:
+    """A bundle, and by what (S, 2) it misses the points of each group."""
 
-    rest: NDArray[np.float64]  # (A, A)
-    rest_gradient: NDArray[np.float64]  # (A,)
-    poses: NDArray[np.float64]  # (F, 6, 6)
-    poses_gradient: NDArray[np.float64]  # (F, 6)
-    mixed: NDArray[np.float64]  # (F, 6, A)
+    bundle: Bundle
+    residuals: list[NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Step:
-    rest: NDArray[np.float64]  # (A,)
-    poses: NDArray[np.float64]  # (F, 6)
+class _Adjustment:
+    """What least squares need: shared are the columns of the layout, blocks are the poses."""
 
+    layout: Layout
+    groups: Sequence[_Group]
+    loss_px: float
 
-def _normal_equations(
-    bundle: Bundle,
-    layout: Layout,
-    groups: Sequence[_Group],
-    residuals: Sequence[NDArray[np.float64]],
-    loss_px: float,
-) -> _Normal:
-    n_poses = len(bundle.rig_from_body)
-    normal = _Normal(
-        np.zeros((layout.size, layout.size)),
-        np.zeros(layout.size),
-        np.zeros((n_poses, POSE, POSE)),
-        np.zeros((n_poses, POSE)),
-        np.zeros((n_poses, POSE, layout.size)),
-    )
-    for group, missed in zip(groups, residuals, strict=True):
-        jacobian, columns = _jacobian(bundle, layout, group)
-        weights = 1.0 / group.sigma_px
-        if np.isfinite(loss_px):  # the weights of the soft L1
-            weights = weights * (1.0 + (missed**2).sum(axis=1) / loss_px**2) ** -0.25
-        rows = np.concatenate([jacobian, missed[:, :, None]], axis=2) * weights[:, None, None]
-        gram = _grams(rows, group)  # (V, n + 6 + 1, n + 6 + 1)
-        n = len(columns)
-        of_all = gram.sum(axis=0)
-        normal.rest[np.ix_(columns, columns)] += of_all[:n, :n]
-        normal.rest_gradient[columns] += of_all[:n, -1]
-        for pose, own in zip(group.poses, gram, strict=True):
-            normal.poses[pose] += own[n:-1, n:-1]
-            normal.poses_gradient[pose] += own[n:-1, -1]
-            normal.mixed[pose][:, columns] += own[n:-1, :n]
-    held = bundle.held_pose
-    normal.poses[held], normal.poses_gradient[held], normal.mixed[held] = np.eye(POSE), 0.0, 0.0
-    return normal
+    def cost(self, state: _Projected) -> float:
+        """Return the robust sum of squares, weighed; NaN where a seen point has no image."""
+        squares = (np.concatenate(state.residuals) ** 2).sum(axis=1)
+        weights = np.concatenate([group.sigma_px**-2.0 for group in self.groups])
+        return float(weights @ soft_l1(squares, self.loss_px))
+
+    def normal_equations(self, state: _Projected) -> NormalEquations:
+        bundle, layout = state.bundle, self.layout
+        normal = NormalEquations.zeros(layout.size, len(bundle.rig_from_body), POSE)
+        for group, missed in zip(self.groups, state.residuals, strict=True):
+            jacobian, columns = _jacobian(bundle, layout, group)
+            weights = soft_l1_weights((missed**2).sum(axis=1), self.loss_px) / group.sigma_px
+            rows = np.concatenate([jacobian, missed[:, :, None]], axis=2) * weights[:, None, None]
+            gram = _grams(rows, group)  # (V, n + 6 + 1, n + 6 + 1)
+            n = len(columns)
+            of_all = gram.sum(axis=0)
+            normal.shared[np.ix_(columns, columns)] += of_all[:n, :n]
+            normal.shared_right[columns] += of_all[:n, -1]
+            for pose, own in zip(group.poses, gram, strict=True):
+                normal.blocks[pose] += own[n:-1, n:-1]
+                normal.blocks_right[pose] += own[n:-1, -1]
+                normal.mixed[pose][:, columns] += own[n:-1, :n]
+        for part in (normal.blocks, normal.blocks_right, normal.mixed):
+            part[bundle.held_pose] = 0.0
+        return normal
+
+    def moved(self, state: _Projected, step: Step) -> _Projected:
+        bundle, layout = state.bundle, self.layout
+        cameras = []
+        for index, camera in enumerate(bundle.cameras):
+            lens = layout.of_lens.get(bundle.lens_of[index])
+            pose = moved_pose(camera.cam_from_world, step.shared[layout.of_camera[index]])
+            params = camera.params if lens is None else camera.params + step.shared[lens]
+            cameras.append(replace(camera, params=params, cam_from_world=pose))
+        poses = list(moved_pose(np.array(bundle.rig_from_body), step.blocks))
+        poses[bundle.held_pose] = bundle.rig_from_body[bundle.held_pose]
+        boards = list(bundle.body_from_board)
+        for board, span in layout.of_board.items():
+            boards[board] = moved_pose(boards[board], step.shared[span])
+        moved = replace(
+            bundle,
+            cameras=tuple(cameras),
+            rig_from_body=tuple(poses),
+            body_from_board=tuple(boards),
+        )
+        return _Projected(moved, _residuals(moved, self.groups))
 
 
 def _jacobian(
@@ -514,101 +501,3 @@ def lens_derivatives(
     widths = np.diag(ahead - behind)  # as rounded
     by_parameter = ((images[0] - images[1]) / widths[:, None, None]).transpose(1, 2, 0)
     return by_point, by_parameter
-
-
-def _reduced(
-    normal: _Normal, damping: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the normal equations without the poses, and what gives the poses back.
-
-    Each diagonal is raised by a share, `damping`.
-    """
-    n_poses, size = len(normal.poses), len(normal.rest)
-    poses = normal.poses + damping * normal.poses * np.eye(POSE)
-    inverse = np.linalg.inv(poses)  # (F, 6, 6)
-    back = inverse @ normal.mixed  # (F, 6, A)
-    rest = normal.rest + damping * np.diag(np.diag(normal.rest))
-    flat_mixed = normal.mixed.reshape(n_poses * POSE, size)
-    rest = rest - flat_mixed.T @ back.reshape(n_poses * POSE, size)
-    own = np.einsum("fij,fj->fi", inverse, normal.poses_gradient)
-    gradient = normal.rest_gradient - flat_mixed.T @ own.reshape(-1)
-    return (rest + rest.T) / 2.0, gradient, back, own
-
-
-def _solve(normal: _Normal, damping: float) -> _Step:
-    information, gradient, back, own = _reduced(normal, damping)
-    scale = np.sqrt(np.diag(normal.rest))
-    scale[scale == 0] = 1.0  # a parameter without effect stays where it is
-    scaled = information / np.outer(scale, scale)
-    scaled[np.diag_indices_from(scaled)] += np.where(np.diag(normal.rest) == 0, 1.0, 0.0)
-    values, vectors = np.linalg.eigh(scaled)
-    # What rounding leaves of a direction that the data do not tell is not walked along.
-    known = values > _LEAST_DAMPING * values[-1]
-    rest = vectors[:, known] @ ((vectors[:, known].T @ (gradient / scale)) / values[known]) / scale
-    return _Step(rest, own - back @ rest)
-
-
-def _largest(step: _Step, normal: _Normal) -> float:
-    """Return the largest entry of a step, by its effect on the root of the sum of squares (px)."""
-    of_rest = np.abs(step.rest) * np.sqrt(np.diag(normal.rest))
-    of_poses = np.abs(step.poses) * np.sqrt(np.einsum("fii->fi", normal.poses))
-    return float(max(of_rest.max(initial=0.0), of_poses.max(initial=0.0)))
-
-
-def _moved(bundle: Bundle, layout: Layout, step: _Step) -> Bundle:
-    cameras = []
-    for index, camera in enumerate(bundle.cameras):
-        lens = layout.of_lens.get(bundle.lens_of[index])
-        cameras.append(
-            replace(
-                camera,
-                params=camera.params if lens is None else camera.params + step.rest[lens],
-                cam_from_world=moved_pose(
-                    camera.cam_from_world, step.rest[layout.of_camera[index]]
-                ),
-            )
-        )
-    return replace(
-        bundle,
-        cameras=tuple(cameras),
-        rig_from_body=tuple(
-            pose if index == bundle.held_pose else moved
-            for index, (pose, moved) in enumerate(
-                zip(
-                    bundle.rig_from_body,
-                    _moved_poses(np.array(bundle.rig_from_body), step.poses),
-                    strict=True,
-                )
-            )
-        ),
-        body_from_board=tuple(
-            moved_pose(pose, step.rest[layout.of_board[board]])
-            if board in layout.of_board
-            else pose
-            for board, pose in enumerate(bundle.body_from_board)
-        ),
-    )
-
-
-def moved_pose(pose: Pose, change: NDArray[np.float64]) -> Pose:
-    """Return a pose (3, 4) moved by (omega, v), (6,), in the frame it leads to.
-
-    To first order ``x + omega x x + v``; the rotation is exact, and freed of rounding.
-    """
-    return np.asarray(_moved_poses(pose[None], change[None])[0])
-
-
-def _moved_poses(poses: NDArray[np.float64], changes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return poses (F, 3, 4), each moved by its (omega, v), (F, 6)."""
-    omega, v = changes[:, :3], changes[:, 3:]
-    angle = np.linalg.norm(omega, axis=1)
-    x, y, z = (omega / np.where(angle > 0, angle, 1.0)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    rotation = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
-    u, _, vt = np.linalg.svd(rotation @ poses[:, :, :3])
-    moved = np.zeros_like(poses)
-    moved[:, :, :3] = u @ vt
-    moved[:, :, 3] = (rotation @ poses[:, :, 3:])[..., 0] + v
-    return moved

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.pose import Pose
+from hybridve.calib.pose import Pose, nearest_rotation
 
 #: Measurements from which the common pose is taken, at most; all of them vote on it.
 _MAX_PROPOSERS = 60
@@ -69,9 +69,7 @@ def mean_pose(poses: NDArray[np.float64], weights: NDArray[np.float64]) -> Pose:
     """Return the weighted mean of poses (M, 3, 4) that lie close together, weights (M,)."""
     share = weights / weights.sum()
     mean = np.tensordot(share, poses, axes=1)
-    u, _, vt = np.linalg.svd(mean[:, :3])
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return np.column_stack([rotation, mean[:, 3]])
+    return np.column_stack([nearest_rotation(mean[:, :3]), mean[:, 3]])
 
 
 def common_pose(

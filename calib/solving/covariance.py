@@ -29,6 +29,9 @@ from hybridve.calib.solving.bundle import (
 )
 from hybridve.calib.solving.errors_in_space import parameter_slices
 
+#: Of the largest eigenvalue: what is below is rounding.
+_ROUNDING = 1e-15
+
 #: Weak knowledge of what no picture told, as standard deviations: a rotation (radians), a place
 #: (metres), and by its share a focal length or, by the image's width, a principal point; the
 #: coefficients of distortion. It keeps the covariance finite where the pictures tell nothing, and
@@ -94,9 +97,15 @@ def _prior(bundle: Bundle, layout: Layout) -> NDArray[np.float64]:
 
 
 def _inverted(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverse of a positive definite matrix whose units differ along the diagonal."""
+    """Return the inverse of a positive definite matrix whose units differ along the diagonal.
+
+    What rounding leaves of a direction that nothing tells may be negative: it counts as the least
+    that rounding lets be told, so that no variance is.
+    """
     scale = np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    half = vectors / np.sqrt(np.maximum(values, _ROUNDING * values[-1])) / scale[:, None]
+    return np.asarray(half @ half.T)
 
 
 def _of_rig(bundle: Bundle, layout: Layout, inverse: NDArray[np.float64]) -> RigCovariance:

@@ -26,9 +26,18 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.lens import cam_from_img, img_from_cam
-from hybridve.calib.pose import Pose, angle_between, transform
+from hybridve.calib.pose import Pose, angle_between, transform, turned_pose
 from hybridve.calib.record import LensChoice
-from hybridve.calib.solving.bundle import lens_derivatives
+from hybridve.calib.solving.bundle import POSE, lens_derivatives
+from hybridve.calib.solving.least_squares import (
+    FLOOR_PX,
+    Limits,
+    NormalEquations,
+    Step,
+    minimized,
+    soft_l1,
+    soft_l1_rows,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -111,18 +120,15 @@ _CLEAR_SIGMA = 10.0
 #: Corners that leave more than this share of the image unvisited leave the lens unknown there.
 _LEAST_COVER = 0.4
 
-_CONVERGED_PX = 1e-9
-_COST_TOLERANCE = 1e-15
-_MAX_STEPS = 200
-_FIRST_DAMPING = 1e-4
-_LEAST_DAMPING = 1e-13
-
-#: What the cost may still fall by where only a start is wanted.
+#: When a fit has converged, as a share of the cost that a step still gains; and where only a start
+#: is wanted.
+_COST_SHARE = 1e-15
 _ROUGH = 1e-3
+_MAX_STEPS = 200
 
-#: Of the largest eigenvalue: what is below is rounding.
+#: A direction that is told by less than this share of what is told best is not known: of a lens of
+#: many coefficients, views tell some combinations 1e-14 as well as others.
 _ROUNDING = 3e-15
-_MOST_DAMPING = 1e12
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,7 +432,7 @@ def adjust_lens(
     free: NDArray[np.bool_],
     move_poses: bool = True,
     max_steps: int = _MAX_STEPS,
-    tolerance: float = _COST_TOLERANCE,
+    tolerance: float = _COST_SHARE,
 ) -> LensAdjustment:
     """Adjust a lens and the poses of its views to the robust least squares (soft L1).
 
@@ -450,34 +456,19 @@ def adjust_lens(
         A step that lowers the cost by less than this share is the last.
     """
     mask = are_finite(batch_residuals(camera, poses, batch))
-    batch = batch.only(mask)
-    cost = _cost(camera, poses, batch, mask, loss_px)
-    damping = _FIRST_DAMPING
-    normal = _normal_equations(camera, poses, batch, mask, loss_px, free, move_poses)
-    for _ in range(max_steps):
-        of_lens, of_poses = _step(normal, damping)
-        params = camera.params + of_lens
-        moved_cost = np.inf
-        if np.isfinite(params).all() and (params[_focal_indices(camera.model)] > 0).all():
-            moved, moved_poses = replace(camera, params=params), _moved(poses, of_poses)
-            moved_cost = _cost(moved, moved_poses, batch, mask, loss_px)
-        is_small = max(
-            np.abs(of_lens * np.sqrt(np.diag(normal.lens))).max(initial=0.0),
-            np.abs(of_poses * np.sqrt(np.einsum("vii->vi", normal.poses))).max(initial=0.0),
-        ) < _CONVERGED_PX * np.sqrt(max(1, mask.sum()))
-        if moved_cost <= cost:
-            gain = cost - moved_cost
-            camera, poses, cost = moved, moved_poses, moved_cost
-            damping = max(damping / 10.0, _LEAST_DAMPING)
-            normal = _normal_equations(camera, poses, batch, mask, loss_px, free, move_poses)
-            if is_small or gain <= tolerance * cost:
-                break
-        elif is_small or damping > _MOST_DAMPING:
-            break
-        else:
-            damping *= 10.0
-    information, scores = _without_poses(normal, 0.0)
-    return LensAdjustment(camera, poses, cost, information, scores)
+    problem = _LensProblem(batch.only(mask), mask, loss_px, free, move_poses)
+    limits = Limits(max_steps, tolerance, max(1, mask.sum()) * FLOOR_PX**2, _ROUNDING)
+    found = minimized(problem, problem.projected(camera, poses), limits)
+    normal = problem.normal_equations(found.state)
+    reduced = normal.reduced()
+    yielded = np.einsum("vip,vi->vp", reduced.back, normal.blocks_right)
+    return LensAdjustment(
+        found.state.camera,
+        found.state.poses,
+        found.cost,
+        reduced.information,
+        normal.pulls - yielded,
+    )
 
 
 def batch_residuals(
@@ -497,123 +488,78 @@ def _points_cam(poses: NDArray[np.float64], batch: Batch) -> NDArray[np.float64]
     return np.asarray(turned + poses[:, None, :, 3])
 
 
-def _cost(
-    camera: Camera,
-    poses: NDArray[np.float64],
-    batch: Batch,
-    mask: NDArray[np.bool_],
-    loss_px: float,
-) -> float:
-    """Return the robust sum of squares; infinite where a seen corner has no image."""
-    squares = (batch_residuals(camera, poses, batch)[mask] ** 2).sum(axis=1)
-    if np.isfinite(loss_px):
-        squares = 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
-    total = float(squares.sum())
-    return total if np.isfinite(total) else np.inf
+@dataclass(frozen=True, slots=True, eq=False)
+class _Projected:
+    """A lens and its views' poses, and by what (S, 2) they miss the corners of the mask."""
+
+    camera: Camera
+    poses: NDArray[np.float64]
+    residuals: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Normal:
-    """The normal equations of a lens and its views' poses, view by view."""
+class _LensEquations(NormalEquations):
+    """Also what each view pulls at the lens (V, P), its pose being held."""
 
-    lens: NDArray[np.float64]  # (P, P)
-    lens_gradients: NDArray[np.float64]  # (V, P)
-    poses: NDArray[np.float64]  # (V, 6, 6)
-    poses_gradient: NDArray[np.float64]  # (V, 6)
-    mixed: NDArray[np.float64]  # (V, 6, P)
+    pulls: NDArray[np.float64]
 
 
-def _normal_equations(
-    camera: Camera,
-    poses: NDArray[np.float64],
-    batch: Batch,
-    mask: NDArray[np.bool_],
-    loss_px: float,
-    free: NDArray[np.bool_],
-    move_poses: bool,
-) -> _Normal:
-    n_views, n_params = len(poses), len(camera.params)
-    points_cam = _points_cam(poses, batch)[mask]  # (S, 3)
-    by_point, by_parameter = lens_derivatives(camera, points_cam)
-    view_of = np.nonzero(mask)[0]
-    turned = points_cam - poses[view_of, :, 3]
-    # d(omega x X) = -[X] omega, and rows of by_point times -[X] are X cross row.
-    by_turn = np.cross(turned[:, None, :], by_point)
-    residuals = batch_residuals(camera, poses, batch)[mask][:, :, None]
-    rows = np.concatenate([by_turn, by_point, by_parameter * free, residuals], axis=2)
-    if np.isfinite(loss_px):
-        # Soft L1 to second order (Triggs et al., section 4.3): with s the squared length by
-        # loss_px, rows are scaled by (1 + s)^(-1/4), along the residual by another (1 + s)^(-1/2).
-        squares = (residuals**2).sum(axis=1)[..., None]
-        stretch = np.sqrt(1.0 + squares / loss_px**2)  # (S, 1, 1)
-        along = residuals @ (residuals.transpose(0, 2, 1) @ rows) / np.maximum(squares, 1e-300)
-        weighted = (rows - (1.0 - 1.0 / stretch) * along) / np.sqrt(stretch)
-        weighted[:, :, -1:] = residuals * np.sqrt(stretch)
-        rows = weighted
-    jacobian = np.zeros((*mask.shape, 2, rows.shape[2]))
-    jacobian[mask] = rows
-    jacobian = jacobian.reshape(n_views, 2 * mask.shape[1], rows.shape[2])
-    gram = jacobian.transpose(0, 2, 1) @ jacobian  # (V, 7 + P, 7 + P)
-    of_poses, of_lens = slice(0, 6), slice(6, 6 + n_params)
-    normal = _Normal(
-        gram[:, of_lens, of_lens].sum(axis=0),
-        gram[:, of_lens, -1],
-        gram[:, of_poses, of_poses].copy(),
-        gram[:, of_poses, -1].copy(),
-        gram[:, of_poses, of_lens].copy(),
-    )
-    if not move_poses:
-        normal.poses[:] = np.eye(6)
-        normal.poses_gradient[:] = 0.0
-        normal.mixed[:] = 0.0
-    return normal
+@dataclass(frozen=True, slots=True, eq=False)
+class _LensProblem:
+    """What least squares need: the lens's parameters are shared, blocks are the views' poses."""
 
+    batch: Batch
+    mask: NDArray[np.bool_]
+    loss_px: float
+    free: NDArray[np.bool_]
+    move_poses: bool
 
-def _without_poses(
-    normal: _Normal, damping: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return information (P, P) and gradients (V, P) of the lens with the poses eliminated."""
-    poses = normal.poses + damping * normal.poses * np.eye(6)
-    back = np.linalg.solve(poses, normal.mixed)  # (V, 6, P)
-    lens = normal.lens + damping * np.diag(np.diag(normal.lens))
-    information = lens - np.einsum("vip,viq->pq", normal.mixed, back)
-    gradients = normal.lens_gradients - np.einsum("vip,vi->vp", back, normal.poses_gradient)
-    return (information + information.T) / 2.0, gradients
+    def projected(self, camera: Camera, poses: NDArray[np.float64]) -> _Projected:
+        return _Projected(camera, poses, batch_residuals(camera, poses, self.batch)[self.mask])
 
+    def cost(self, state: _Projected) -> float:
+        return float(soft_l1((state.residuals**2).sum(axis=1), self.loss_px).sum())
 
-def _step(normal: _Normal, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    information, gradients = _without_poses(normal, damping)
-    of_lens = _inverse(information, np.diag(normal.lens)) @ gradients.sum(axis=0)
-    poses = normal.poses + damping * normal.poses * np.eye(6)
-    rest = normal.poses_gradient - normal.mixed @ of_lens
-    return of_lens, np.linalg.solve(poses, rest[..., None])[..., 0]
+    def moved(self, state: _Projected, step: Step) -> _Projected | None:
+        params = state.camera.params + step.shared
+        if not np.isfinite(params).all() or params[_focal_indices(state.camera.model)].min() <= 0:
+            return None
+        camera = replace(state.camera, params=params)
+        return self.projected(camera, turned_pose(state.poses, step.blocks))
 
+    def normal_equations(self, state: _Projected) -> _LensEquations:
+        gram = self._grams(state)
+        of_poses, of_lens = slice(0, POSE), slice(POSE, -1)
+        normal = _LensEquations(
+            gram[:, of_lens, of_lens].sum(axis=0),
+            gram[:, of_lens, -1].sum(axis=0),
+            gram[:, of_poses, of_poses],
+            gram[:, of_poses, -1],
+            gram[:, of_poses, of_lens],
+            gram[:, of_lens, -1],
+        )
+        if not self.move_poses:
+            for part in (normal.blocks, normal.blocks_right, normal.mixed):
+                part[:] = 0.0
+        return normal
 
-def _inverse(
-    information: NDArray[np.float64], diagonal: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the inverse of an information matrix where it is known; zero where it is not.
-
-    What rounding leaves of a direction that the data do not tell must not be walked along.
-    """
-    scale = np.sqrt(diagonal)
-    scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    known = values > _ROUNDING * max(values[-1], 1e-300)
-    vectors = vectors[:, known] / scale[:, None]
-    return np.asarray((vectors / values[known]) @ vectors.T)
-
-
-def _moved(poses: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return poses (V, 3, 4) turned by omega about the board's origin, then shifted: (V, 6)."""
-    angle = np.linalg.norm(steps[:, :3], axis=1)
-    x, y, z = (steps[:, :3] / np.maximum(angle, 1e-300)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-    sine, rest = np.sin(angle)[:, None, None], (1.0 - np.cos(angle))[:, None, None]
-    turns = np.eye(3) + sine * cross + rest * cross @ cross
-    u, _, vt = np.linalg.svd(turns @ poses[:, :, :3])
-    return np.concatenate([u @ vt, (poses[:, :, 3] + steps[:, 3:])[..., None]], axis=2)
+    def _grams(self, state: _Projected) -> NDArray[np.float64]:
+        """Return products (V, 6 + P + 1, 6 + P + 1) of columns by pose, lens, and residuals."""
+        points_cam = _points_cam(state.poses, self.batch)[self.mask]  # (S, 3)
+        by_point, by_parameter = lens_derivatives(state.camera, points_cam)
+        turned = points_cam - state.poses[np.nonzero(self.mask)[0], :, 3]
+        # d(omega x X) = -[X] omega, and rows of by_point times -[X] are X cross row.
+        by_turn = np.cross(turned[:, None, :], by_point)
+        rows, residuals = soft_l1_rows(
+            np.concatenate([by_turn, by_point, by_parameter * self.free], axis=2),
+            state.residuals,
+            self.loss_px,
+        )
+        rows = np.concatenate([rows, residuals[..., None]], axis=2)
+        jacobian = np.zeros((*self.mask.shape, *rows.shape[1:]))
+        jacobian[self.mask] = rows
+        jacobian = jacobian.reshape(len(self.mask), 2 * self.mask.shape[1], rows.shape[2])
+        return np.asarray(jacobian.transpose(0, 2, 1) @ jacobian)
 
 
 # --- Seeds ------------------------------------------------------------------------------------
@@ -982,7 +928,7 @@ def fit_batch(
                 "sharper pictures, or choose another model"
             )
         part = batch.only(mask).of(used)
-        free, tolerance = (rough, _ROUGH) if is_rough else (every, _COST_TOLERANCE)
+        free, tolerance = (rough, _ROUGH) if is_rough else (every, _COST_SHARE)
         adjusted = adjust_lens(lens, poses[used], part, settings.loss_px, free, tolerance=tolerance)
         lens = adjusted.camera
         poses[used] = adjusted.poses

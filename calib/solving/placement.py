@@ -1,15 +1,12 @@
 """Boards placed before cameras: by least squares over poses, a common scale and focal lengths.
 
 Board points are multiplied by one scale, placed in the world once a moment, and seen by cameras of
-which some may be let move or zoom. The placements are eliminated (Schur complement), as in
-`hybridve.calib.solving.bundle`; all views are evaluated at once, since a check tries many
+which some may be let move or zoom. The placements are eliminated
+(`hybridve.calib.solving.least_squares`); all views are evaluated at once, since a check tries many
 alternatives.
 
 Poses T are adjusted as exp(xi) T with xi = (omega, v) in the frame they lead to; those of boards
 turn about the board's own origin, so that a world far from its boards loses nothing.
-
-This work is based on: Triggs, McLauchlan, Hartley and Fitzgibbon, *Bundle adjustment: a modern
-synthesis*, 2000.
 """
 
 from collections.abc import Sequence
@@ -21,7 +18,17 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam, parameter_names
-from hybridve.calib.solving.bundle import POSE, lens_derivatives, moved_pose
+from hybridve.calib.pose import moved_pose, turned_pose
+from hybridve.calib.solving.bundle import POSE, lens_derivatives
+from hybridve.calib.solving.least_squares import (
+    FLOOR_PX,
+    Limits,
+    NormalEquations,
+    Step,
+    minimized,
+    soft_l1,
+    soft_l1_weights,
+)
 
 #: Step of the central differences of a lens by its rays, relative.
 _RAY_STEP = 1e-6
@@ -29,11 +36,7 @@ _RAY_STEP = 1e-6
 #: A point behind its camera misses by so many image widths.
 _BEHIND_WIDTHS = 10.0
 
-_COST_TOLERANCE = 1e-7
-_COST_FLOOR_PX = 1e-9
-_FIRST_DAMPING = 1e-4
-_LEAST_DAMPING = 1e-12
-_MOST_DAMPING = 1e9
+_COST_SHARE = 1e-7
 _MAX_STEPS = 60
 
 #: A step changes the logarithm of a scale or focal length by this at most.
@@ -178,77 +181,61 @@ def place_boards(
     loss_px : float
         Points that miss by more count less than squared (soft L1).
     """
-    now, damping = start, _FIRST_DAMPING
-    residuals = residuals_of(views, now)
-    cost = _cost(residuals, loss_px)
-    floor = views.pixels.size * _COST_FLOOR_PX**2
-    system = None
-    for _ in range(_MAX_STEPS):
-        if system is None:
-            system = _System(views, now, residuals, moving, zooming, scaled, loss_px)
-        trial = system.step(now, damping)
-        trial_residuals = residuals_of(views, trial)
-        trial_cost = _cost(trial_residuals, loss_px)
-        if trial_cost < cost:
-            gain = cost - trial_cost
-            now, residuals, cost, system = trial, trial_residuals, trial_cost, None
-            damping = max(damping / 10.0, _LEAST_DAMPING)
-            if gain <= _COST_TOLERANCE * cost + floor:
-                break
-        else:
-            damping *= 10.0
-            if trial_cost - cost <= _COST_TOLERANCE * cost + floor or damping > _MOST_DAMPING:
-                break
-    return now
+    problem = _Placement(views, tuple(moving), tuple(zooming), scaled, loss_px)
+    limits = Limits(_MAX_STEPS, _COST_SHARE, views.pixels.size * FLOOR_PX**2)
+    return minimized(problem, problem.projected(start), limits).state.placed
 
 
-def _cost(residuals: NDArray[np.float64], loss_px: float) -> float:
-    squares = np.nansum(residuals**2, axis=2)
-    if np.isfinite(loss_px):
-        squares = 2.0 * loss_px**2 * (np.sqrt(1.0 + squares / loss_px**2) - 1.0)
-    return float(squares.sum())
+@dataclass(frozen=True, slots=True, eq=False)
+class _Projected:
+    """Cameras and boards, and by what (V, N, 2) they miss what was seen."""
+
+    placed: Placed
+    residuals: NDArray[np.float64]
 
 
-class _System:
-    """The normal equations of one step: cameras, focal lengths and scale (A), placements (F of 6).
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placement:
+    """What least squares need: cameras, focal lengths and scale are shared, blocks are placements.
 
     All is computed for every view at once: columns of a view are its camera's pose, the board's,
     the focal length's and the scale's logarithm, and last its residuals.
     """
 
-    def __init__(
-        self,
-        views: Views,
-        placed: Placed,
-        residuals: NDArray[np.float64],
-        moving: Sequence[int],
-        zooming: Sequence[int],
-        scaled: bool,
-        loss_px: float,
-    ) -> None:
-        self.moving, self.zooming, self.scaled = tuple(moving), tuple(zooming), scaled
-        n_shared = POSE * len(moving) + len(zooming) + scaled
-        jacobian = _jacobian(views, placed, residuals, loss_px)
+    views: Views
+    moving: tuple[int, ...]
+    zooming: tuple[int, ...]
+    scaled: bool
+    loss_px: float
+
+    def projected(self, placed: Placed) -> _Projected:
+        return _Projected(placed, residuals_of(self.views, placed))
+
+    def cost(self, state: _Projected) -> float:
+        squares = np.nansum(state.residuals**2, axis=2)
+        return float(soft_l1(squares, self.loss_px).sum())
+
+    def normal_equations(self, state: _Projected) -> NormalEquations:
+        views = self.views
+        jacobian = _jacobian(views, state.placed, state.residuals, self.loss_px)
         gram = jacobian.transpose(0, 2, 1) @ jacobian  # (V, 15, 15)
-        n_places = len(placed.boards)
-        self.rest, self.gradient = np.zeros((n_shared, n_shared)), np.zeros(n_shared)
-        self.boards = np.zeros((n_places, POSE, POSE))
-        self.boards_gradient = np.zeros((n_places, POSE))
-        self.mixed = np.zeros((n_places, POSE, n_shared))
+        n_shared = POSE * len(self.moving) + len(self.zooming) + self.scaled
+        normal = NormalEquations.zeros(n_shared, len(state.placed.boards), POSE)
         board = slice(POSE, 2 * POSE)
-        np.add.at(self.boards, views.place, gram[:, board, board])
-        np.add.at(self.boards_gradient, views.place, gram[:, board, -1])
+        np.add.at(normal.blocks, views.place, gram[:, board, board])
+        np.add.at(normal.blocks_right, views.place, gram[:, board, -1])
         for index in np.unique(views.camera):
             taken, columns = self._columns(int(index))
             if not taken:
                 continue
             own = views.camera == index
             mine = gram[own]
-            self.rest[np.ix_(columns, columns)] += mine[:, taken][:, :, taken].sum(axis=0)
-            self.gradient[columns] += mine[:, taken, -1].sum(axis=0)
+            normal.shared[np.ix_(columns, columns)] += mine[:, taken][:, :, taken].sum(axis=0)
+            normal.shared_right[columns] += mine[:, taken, -1].sum(axis=0)
             mixed = np.zeros((len(mine), POSE, n_shared))
             mixed[:, :, columns] = mine[:, board][:, :, taken]
-            np.add.at(self.mixed, views.place[own], mixed)
+            np.add.at(normal.mixed, views.place[own], mixed)
+        return normal
 
     def _columns(self, camera: int) -> tuple[list[int], list[int]]:
         """Return a camera's columns among those of its views, and among the shared unknowns."""
@@ -267,46 +254,19 @@ class _System:
             columns.append(n_moving + len(self.zooming))
         return taken, columns
 
-    def step(self, placed: Placed, damping: float) -> Placed:
-        """Return the cameras and boards after a damped step."""
-        boards = self.boards.copy()
-        diagonal = np.einsum("fii->fi", boards)  # a view of it
-        diagonal *= 1.0 + damping
-        diagonal[self.boards[:, 0, 0] == 0] = 1.0  # seen by nobody
-        inverse = np.linalg.inv(boards)
-        back = inverse @ self.mixed
-        own = np.einsum("fij,fj->fi", inverse, self.boards_gradient)
-        rest = self.rest + damping * np.diag(np.diag(self.rest))
-        rest = rest - np.einsum("fia,fib->ab", self.mixed, back)
-        gradient = self.gradient - np.einsum("fia,fi->a", self.mixed, own)
-        shared = solve_scaled((rest + rest.T) / 2.0, gradient)[0]
-        moves = own - back @ shared
-        cameras = list(placed.cameras)
+    def moved(self, state: _Projected, step: Step) -> _Projected:
+        cameras = list(state.placed.cameras)
         for number, index in enumerate(self.moving):
-            change = shared[POSE * number : POSE * (number + 1)]
+            change = step.shared[POSE * number : POSE * (number + 1)]
             pose = moved_pose(cameras[index].cam_from_world, change)
             cameras[index] = replace(cameras[index], cam_from_world=pose)
+        factors = np.exp(np.clip(step.shared, -_LARGEST_CHANGE, _LARGEST_CHANGE))
         first = POSE * len(self.moving)
         for number, index in enumerate(self.zooming):
-            change = np.clip(shared[first + number], -_LARGEST_CHANGE, _LARGEST_CHANGE)
-            cameras[index] = zoomed(cameras[index], float(np.exp(change)))
-        scale = placed.scale
-        if self.scaled:
-            scale *= float(np.exp(np.clip(shared[-1], -_LARGEST_CHANGE, _LARGEST_CHANGE)))
-        boards = _turned(placed.boards, moves)
-        return Placed(tuple(cameras), boards, scale)
-
-
-def _turned(boards: NDArray[np.float64], moves: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return boards' poses (F, 3, 4) turned about their own origins and shifted by (F, 6)."""
-    angles = np.linalg.norm(moves[:, :3], axis=1)[:, None, None]
-    x, y, z = (moves[:, :3] / np.maximum(angles[:, 0], 1e-300)).T
-    cross = np.zeros((len(moves), 3, 3))
-    cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = x, y, z
-    cross -= cross.transpose(0, 2, 1)
-    turns = np.eye(3) + np.sin(angles) * cross + (1.0 - np.cos(angles)) * cross @ cross
-    shifted = boards[:, :, 3] + moves[:, 3:]
-    return np.concatenate([turns @ boards[:, :, :3], shifted[:, :, None]], axis=2)
+            cameras[index] = zoomed(cameras[index], float(factors[first + number]))
+        scale = state.placed.scale * (float(factors[-1]) if self.scaled else 1.0)
+        boards = turned_pose(state.placed.boards, step.blocks)
+        return self.projected(Placed(tuple(cameras), boards, scale))
 
 
 def zoomed(camera: Camera, factor: float) -> Camera:
@@ -321,7 +281,7 @@ def zoomed(camera: Camera, factor: float) -> Camera:
 def _jacobian(
     views: Views, placed: Placed, residuals: NDArray[np.float64], loss_px: float
 ) -> NDArray[np.float64]:
-    """Return the derivatives (V, 2 N, 15) of the images in the columns of `_System`."""
+    """Return the derivatives (V, 2 N, 15) of the images in the columns of `_Placement`."""
     arms, points_cam = _points(views, placed)
     rotations = placed.poses[views.camera][:, :, :3]
     seen = views.seen
@@ -344,9 +304,8 @@ def _jacobian(
     ]
     jacobian = np.concatenate(columns, axis=3)
     jacobian[~seen] = 0.0
-    if np.isfinite(loss_px):  # the weights of the soft L1
-        squares = np.nan_to_num(residuals**2).sum(axis=2)
-        jacobian *= ((1.0 + squares / loss_px**2) ** -0.25)[..., None, None]
+    squares = np.nan_to_num(residuals**2).sum(axis=2)
+    jacobian *= soft_l1_weights(squares, loss_px)[..., None, None]
     return np.asarray(jacobian.reshape(len(jacobian), -1, jacobian.shape[3]))
 
 
@@ -390,10 +349,7 @@ def information_of(
     arms, points_cam = _points(views, placed)
     ends = np.cumsum([0, *(POSE + len(camera.params) for camera in placed.cameras)])
     of_camera = [slice(int(a), int(b)) for a, b in pairwise(ends)]
-    n_all, n_places = int(ends[-1]), len(placed.boards)
-    information, gradient = np.zeros((n_all, n_all)), np.zeros(n_all)
-    boards, mixed = np.zeros((n_places, POSE, POSE)), np.zeros((n_places, POSE, n_all))
-    pulls = np.zeros((n_places, POSE))
+    normal = NormalEquations.zeros(int(ends[-1]), len(placed.boards), POSE)
     seen = views.seen
     for index, (camera, span) in enumerate(zip(placed.cameras, of_camera, strict=True)):
         mine = views.camera == index
@@ -417,13 +373,10 @@ def information_of(
         gram = jacobian.transpose(0, 2, 1) @ jacobian
         n_own, places = span.stop - span.start, views.place[mine]
         board = slice(n_own, n_own + POSE)
-        information[span, span] += gram[:, :n_own, :n_own].sum(axis=0)
-        gradient[span] -= gram[:, :n_own, -1].sum(axis=0)
-        np.add.at(boards, places, gram[:, board, board])
-        np.add.at(pulls, places, gram[:, board, -1])
-        np.add.at(mixed[:, :, span], places, gram[:, board, :n_own])
-    boards[boards[:, 0, 0] == 0] = np.eye(POSE)
-    inverse = np.linalg.inv(boards)
-    information -= np.einsum("fia,fij,fjb->ab", mixed, inverse, mixed, optimize=True)
-    gradient += np.einsum("fia,fij,fj->a", mixed, inverse, pulls, optimize=True)
-    return (information + information.T) / 2.0, gradient, of_camera
+        normal.shared[span, span] += gram[:, :n_own, :n_own].sum(axis=0)
+        normal.shared_right[span] += gram[:, :n_own, -1].sum(axis=0)
+        np.add.at(normal.blocks, places, gram[:, board, board])
+        np.add.at(normal.blocks_right, places, gram[:, board, -1])
+        np.add.at(normal.mixed[:, :, span], places, gram[:, board, :n_own])
+    reduced = normal.reduced()
+    return reduced.information, -reduced.right, of_camera

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.pose import cross_matrix
 from hybridve.hull.cad.part import (
     Contents,
     Part,
@@ -377,8 +378,7 @@ def _rotate(values: NDArray[np.float64]) -> NDArray[np.float64]:
     sine, cosine = math.sin(math.radians(rest)), math.cos(math.radians(rest))
     for _ in range(int(quarters % 4)):
         sine, cosine = cosine, -sine
-    x, y, z = x / length, y / length, z / length
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    across = cross_matrix(np.array([x, y, z]) / length)
     matrix[:3, :3] += sine * across + (1.0 - cosine) * (across @ across)
     return matrix
 

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.pose import nearest_to_axes
+from hybridve.calib.pose import nearest_to_axes, rotation_of, rotation_vector
 from hybridve.hull.query.frame import Frame
 
 Unseen = Literal["carve", "keep"]
@@ -303,7 +303,7 @@ def interpolated_views(before: Views, after: Views, fraction: float) -> Views:
     ):
         raise ValueError("not of the same views, nor of the same cameras moved")
     # Both are K R with one K, or they are not of one camera.
-    turns = np.linalg.solve(first[:, :, :3], second[:, :, :3])  # (C, 3, 3)
+    turns = np.asarray(np.linalg.solve(first[:, :, :3], second[:, :, :3]), np.float64)  # (C, 3, 3)
     error = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max()
     if not error < _ROTATION_TOLERANCE:
         raise ValueError("not of the same views, nor of the same cameras moved")
@@ -311,8 +311,9 @@ def interpolated_views(before: Views, after: Views, fraction: float) -> Views:
         return after if fraction else before
     centers = (1.0 - fraction) * _centers(first) + fraction * _centers(second)
     matrices = first.copy()
-    for camera in np.flatnonzero((first != second).any(axis=(1, 2))):
-        turn = cv2.Rodrigues(fraction * _rotation_vector(turns[camera]))[0]
+    moved = np.flatnonzero((first != second).any(axis=(1, 2)))
+    shares = rotation_of(fraction * rotation_vector(turns[moved]))
+    for camera, turn in zip(moved, shares, strict=True):
         matrix = first[camera, :, :3] @ turn
         matrices[camera] = np.column_stack([matrix, -matrix @ centers[camera]])
     return replace(before, img_from_local=matrices)
@@ -322,22 +323,6 @@ def _is_same_seen(first: Seen | None, second: Seen | None) -> bool:
     if first is None or second is None:
         return first is second
     return first.is_same(second)
-
-
-def _rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return axis times angle (3,) of a rotation; OpenCV's forgets angles below 1e-5."""
-    axis = 0.5 * np.array(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
-    sine = float(np.linalg.norm(axis))
-    cosine = 0.5 * (float(np.trace(rotation)) - 1.0)
-    if cosine < 0.0:
-        return np.asarray(cv2.Rodrigues(rotation)[0].ravel(), np.float64)
-    return axis * (np.arctan2(sine, cosine) / sine) if sine else axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)

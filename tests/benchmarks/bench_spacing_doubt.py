@@ -38,8 +38,8 @@ from helpers.erring_task import erring_task
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens_bound import lens_shift_px
+from hybridve.calib.pose import moved_pose
 from hybridve.calib.rig import Rig, RigCovariance
-from hybridve.calib.solving.bundle import moved_pose
 from hybridve.calib.solving.covariance import camera_parameter_names
 from hybridve.calib.solving.errors_in_space import parameter_slices
 from hybridve.hull.cad.scene import load_scene

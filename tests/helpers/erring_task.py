@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from helpers.cones import ball_extent, plate
 from helpers.hulls import ball_masks, look_at
 from hybridve.calib.camera import Camera
+from hybridve.calib.pose import moved_pose
 from hybridve.calib.rig import Rig, RigCovariance
-from hybridve.calib.solving.bundle import moved_pose
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.outline_errors import DoubtSettings, outline_errors
 from hybridve.hull.contact.spacing import (

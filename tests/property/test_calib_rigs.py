@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.foreign import rotation_vector
 from hybridve.calib.formats.rig_export import FORMATS, UNITS_M, export_rig
 from hybridve.calib.formats.rig_json import read_rig, rig_to_dict, write_rig
 from hybridve.calib.formats.rigs import import_rig, read_any_rig
 from hybridve.calib.lens import img_from_cam, project_points
-from hybridve.calib.pose import compose, rotation_about_axes
+from hybridve.calib.pose import compose, rotation_about_axes, rotation_vector
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
