@@ -25,7 +25,7 @@ from hybridve.calib.placing.scene_votes import unmirrored
 from hybridve.calib.placing.surroundings import LooksByVote, describe_scene, with_floor
 from hybridve.calib.pose import compose
 from hybridve.calib.record import Labelling
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 SIZE_PX = (320, 240)
 

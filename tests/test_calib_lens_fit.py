@@ -13,13 +13,8 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.pose import Pose, angle_between, rotation_about_axes, transform
-from hybridve.calib.solving.lens_fit import (
-    LensSettings,
-    fit_lens,
-    fit_shared_lens,
-    locate_board,
-    rays_of,
-)
+from hybridve.calib.solving.lens_fit import LensSettings, fit_lens, fit_shared_lens
+from hybridve.calib.solving.locate import locate_board, rays_of
 
 #: Noise-free corners determine poses to this (metres, radians) ...
 EXACT = 1e-6

@@ -23,7 +23,7 @@ from hybridve.calib.placing.link import Linked, link_cameras
 from hybridve.calib.placing.moments import Body, Moment, PoseKey
 from hybridve.calib.placing.never_met import solve_joint
 from hybridve.calib.pose import Pose, angle_between, compose, invert, transform
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 #: Noise-free views chain to this: metres and radians.
 EXACT = 1e-7

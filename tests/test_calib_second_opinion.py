@@ -26,10 +26,10 @@ from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.judging.certificate import working_volume
 from hybridve.calib.placing import fixed_cameras
 from hybridve.calib.placing.settings import LensRequest
-from hybridve.calib.pose import compose
+from hybridve.calib.pose import compose, moved_pose
 from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, adjust, moved_pose
+from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, adjust
 from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.covariance import even_covariance, rig_covariance
 from hybridve.calib.solving.errors_in_space import parameter_slices, point_errors, point_gains

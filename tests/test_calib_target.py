@@ -18,7 +18,7 @@ from hybridve.calib.boards.target import (
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import transform
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 #: What 16 rays a pixel and 256 grey levels leave of a corner's place; half a pixel is far more.
 RENDERED_RMS_PX = 0.03

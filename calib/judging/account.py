@@ -28,7 +28,8 @@ from hybridve.calib.record import (
 from hybridve.calib.rig import Rig, RigCovariance
 from hybridve.calib.solving.bundle import POSE, BundleView
 from hybridve.calib.solving.covariance import camera_parameter_names
-from hybridve.calib.solving.lens_fit import FittedLens, rms
+from hybridve.calib.solving.lens_fit import FittedLens
+from hybridve.calib.solving.locate import rms
 from hybridve.calib.solving.second_opinion import second_opinion
 
 #: Outliers that are listed one by one.

@@ -24,7 +24,7 @@ from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.rig import Rig
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.consensus import common_pose
-from hybridve.calib.solving.lens_fit import board_residuals, rms
+from hybridve.calib.solving.locate import board_residuals, rms
 from hybridve.calib.solving.placement import (
     Placed,
     Views,

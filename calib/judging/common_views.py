@@ -13,7 +13,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.pose import Pose, compose
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 #: Placements that are used of each two cameras, at least if there are as many: more change nothing.
 _PAIR_PLACEMENTS = 40

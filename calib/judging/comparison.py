@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
+from hybridve.calib.pose import nearest_rotation, rotation_vector
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.placement import Views, solve_scaled
 
@@ -220,7 +221,7 @@ class Comparison:
             shift = similarity.scale * today[:, 3] - rotation @ similarity.shift
             relative = rotation @ stated[:, :3].T
             first = self.spans[index].start
-            off[first : first + 3] = _turn_of(relative)
+            off[first : first + 3] = rotation_vector(relative)
             off[first + 3 : first + POSE] = (shift - relative @ stated[:, 3]) / similarity.scale
         return off
 
@@ -230,8 +231,7 @@ class Comparison:
             self.stated[index].cam_from_world[:, :3].T @ self.today[index].cam_from_world[:, :3]
             for index in held
         )
-        u, _, vt = np.linalg.svd(together)
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        rotation = nearest_rotation(np.asarray(together))
         centers = np.array([self.stated[index].center_world for index in held])
         turned = np.array([self.today[index].center_world for index in held]) @ rotation.T
         if scale is None:
@@ -242,17 +242,3 @@ class Comparison:
             scale = spread / max(spread_today, 1e-12)
             scale = scale if len(held) > 1 and scale > 0 else 1.0
         return _Similarity(rotation, centers.mean(axis=0) - scale * turned.mean(axis=0), scale)
-
-
-def _turn_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation vector (3,) of a rotation."""
-    axis = 0.5 * np.array(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
-    sine = float(np.linalg.norm(axis))
-    angle = math.atan2(sine, 0.5 * (float(np.trace(rotation)) - 1.0))
-    return axis * (angle / sine if sine > 1e-12 else 1.0)

@@ -10,7 +10,7 @@ from hybridve.calib.judging.comparison import LEAST_NOISE_PX, chance_of
 from hybridve.calib.pose import angle_between, compose, invert
 from hybridve.calib.solving.bundle import POSE
 from hybridve.calib.solving.consensus import common_pose
-from hybridve.calib.solving.lens_fit import rms
+from hybridve.calib.solving.locate import rms
 from hybridve.calib.solving.placement import place_boards, residuals_of
 from hybridve.calib.verdict import Moved
 

@@ -12,7 +12,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.placing.board_tracks import Tracks
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.solving.consensus import common_pose
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 #: Offsets tried, and common instants from which each is judged.
 MAX_OFFSET_FRAMES = 25

@@ -25,15 +25,16 @@ from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.moments import Body, body_of
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.placing.world import SeenBoards, place_world
-from hybridve.calib.pose import Pose, compose, invert
+from hybridve.calib.pose import Pose, compose, invert, moved_pose, nearest_rotation
 from hybridve.calib.record import Labelling, Noise, Outlier, WorldRecord
 from hybridve.calib.rig import Rig, RigCovariance
-from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, BundleView, adjust, moved_pose
+from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, BundleView, adjust
 from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.consensus import common_pose
 from hybridve.calib.solving.covariance import even_covariance, in_world, rig_covariance
 from hybridve.calib.solving.errors_in_space import parameter_slices
-from hybridve.calib.solving.lens_fit import FittedLens, locate_board, rms
+from hybridve.calib.solving.lens_fit import FittedLens
+from hybridve.calib.solving.locate import locate_board, rms
 from hybridve.calib.solving.noise import measure_group_noise, measure_noise
 
 logger = logging.getLogger(__name__)
@@ -352,8 +353,7 @@ def make_bundle(
 
 
 def _rigid(pose: Pose) -> Pose:
-    u, _, vt = np.linalg.svd(pose[:, :3])
-    return np.column_stack([u @ vt, pose[:, 3]])
+    return np.column_stack([nearest_rotation(pose[:, :3]), pose[:, 3]])
 
 
 def _refuse_wrong_clips(rough: Adjusted, linked: Linked) -> None:

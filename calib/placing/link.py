@@ -39,7 +39,7 @@ from hybridve.calib.placing.recording_faults import refuse_copies, refuse_exchan
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.solving.bundle import BundleView
 from hybridve.calib.solving.consensus import pose_distances
-from hybridve.calib.solving.lens_fit import rms
+from hybridve.calib.solving.locate import rms
 
 #: A view is left out where it misses the place that the others give its board by this share of the
 #: board's size in the image, and by so many times what its camera misses by in the median. From a

@@ -12,7 +12,8 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.placing.moments import Moment, OnBody
 from hybridve.calib.pose import Pose, compose, invert, transform
-from hybridve.calib.solving.lens_fit import locate_board, view_label
+from hybridve.calib.solving.lens_judge import view_label
+from hybridve.calib.solving.locate import locate_board
 
 #: Common views that differ by more than this (radians plus shares of the board's distance, median)
 #: share no relative pose.

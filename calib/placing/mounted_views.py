@@ -17,7 +17,7 @@ from hybridve.calib.pose import (
     nearest_rotation,
     rotation_vector,
 )
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
 from hybridve.calib.placing.looks import NamedBoard, SolvedLens, corner_residuals
 from hybridve.calib.pose import Pose
-from hybridve.calib.solving.lens_fit import locate_board, rms
+from hybridve.calib.solving.locate import locate_board, rms
 
 #: A clip that misses its lens by more than so many times what the stills do, or than the limit
 #: (both median root mean squares), is suspicious; another camera's lens explains it if it misses

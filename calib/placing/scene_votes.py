@@ -17,7 +17,7 @@ from hybridve.calib.placing.surroundings import (
     with_floor,
 )
 from hybridve.calib.pose import Pose, compose
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 #: Whether a picture is mirrored is asked of so many pairs of each camera, the nearest first, and,
 #: where nothing else is, of so many features: the answer must be quick where pictures agree, and

@@ -29,8 +29,7 @@ from hybridve.calib.boards.board import is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_by_params, img_from_cam
-from hybridve.calib.pose import Pose, transform
-from hybridve.calib.pose import moved_pose as moved_pose
+from hybridve.calib.pose import Pose, moved_pose, transform
 from hybridve.calib.solving.least_squares import (
     FLOOR_PX,
     Limits,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import parameter_names
-from hybridve.calib.pose import Pose
+from hybridve.calib.pose import Pose, cross_matrix
 from hybridve.calib.rig import RigCovariance
 from hybridve.calib.solving.bundle import (
     POSE,
@@ -181,7 +181,5 @@ def in_world(
 
 def _turned_twist(b_from_a: Pose) -> NDArray[np.float64]:
     """Return the matrix (6, 6) that takes (omega, v) in frame a to frame b (the adjoint)."""
-    rotation, (x, y, z) = b_from_a[:, :3], b_from_a[:, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    zero = np.zeros((3, 3))
-    return np.block([[rotation, zero], [cross @ rotation, rotation]])
+    rotation, cross = b_from_a[:, :3], cross_matrix(b_from_a[:, 3])
+    return np.block([[rotation, np.zeros((3, 3))], [cross @ rotation, rotation]])

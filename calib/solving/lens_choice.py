@@ -26,24 +26,19 @@ from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.camera import N_PARAMS, Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.record import CandidateLens, LensChoice
+from hybridve.calib.solving.lens_adjust import Batch, LensAdjustment, adjust_lens, batch_residuals
 from hybridve.calib.solving.lens_fit import (
-    Batch,
-    Fit,
     FittedLens,
-    LensAdjustment,
     LensSettings,
-    adjust_lens,
-    are_finite,
-    batch_residuals,
     collect_views,
     fit_batch,
-    imitate,
     make_batch,
     noise_of,
-    rays_of,
-    refuse_degenerate,
     share_out,
 )
+from hybridve.calib.solving.lens_judge import Fit, refuse_degenerate
+from hybridve.calib.solving.lens_seed import imitate
+from hybridve.calib.solving.locate import are_finite, rays_of
 
 #: The lenses that corners are judged by: between them they do what the candidates do.
 _FLEXIBLE = ("OPENCV_FISHEYE", "OPENCV")

@@ -55,11 +55,11 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.placing.fixed_cameras import make_bundle
 from hybridve.calib.placing.link import link_cameras
-from hybridve.calib.pose import compose, invert, transform
+from hybridve.calib.pose import compose, invert, moved_pose, transform
 from hybridve.calib.rig import Rig
-from hybridve.calib.solving.bundle import moved_pose
 from hybridve.calib.solving.colmap_adjust import colmap_adjust
-from hybridve.calib.solving.lens_fit import LensSettings, fit_shared_lens, locate_board
+from hybridve.calib.solving.lens_fit import LensSettings, fit_shared_lens
+from hybridve.calib.solving.locate import locate_board
 
 NOISE_PX = 0.3
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from helpers.boards import board_poses, project, ring
 from hybridve.calib.boards.target import Chessboard
-from hybridve.calib.pose import compose, invert, rotation_about_axes
-from hybridve.calib.solving.bundle import Bundle, BundleView, moved_pose, view_residuals
+from hybridve.calib.pose import compose, invert, moved_pose, rotation_about_axes
+from hybridve.calib.solving.bundle import Bundle, BundleView, view_residuals
 
 BOARD = Chessboard(7, 6, 0.1)
 

@@ -13,7 +13,7 @@ from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.pose import Pose, compose, invert, transform
-from hybridve.calib.solving.lens_fit import locate_board
+from hybridve.calib.solving.locate import locate_board
 
 
 @dataclass(frozen=True, slots=True, eq=False)
