@@ -5,10 +5,10 @@ plain Python threads run them side by side, and are kept on disk, so that nothin
 the first time (see `hybridve.hull.prepare`). Division by zero gives infinity, as in NumPy.
 
 numba notices when the file of a function changes, but not when a function that it calls does, in
-another file. So what is kept lies in a folder named after all sources that are compiled, in
-``compiled`` of the cache (see `hybridve.calib.cache`), or in ``NUMBA_CACHE_DIR`` where that is set.
-To load this module reads the sources, and makes nothing; the folder is opened for the first
-function that is called.
+another file. So what is kept lies in a folder named after all sources that are compiled and where
+they are, in ``compiled`` of the cache (see `hybridve.calib.cache`), or in ``NUMBA_CACHE_DIR`` where
+that is set. To load this module reads the sources, and makes nothing; the folder is opened for the
+first function that is called.
 """
 
 import hashlib
@@ -66,8 +66,9 @@ def open_folder(name: str | None = None) -> Path | None:
 
 
 def _digest() -> str:
-    digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.rglob("*.py")):
+    here = Path(__file__).resolve().parent
+    digest = hashlib.sha256(os.fsencode(here))  # numba keeps the code of each place apart, too
+    for source in sorted(here.rglob("*.py")):
         text = source.read_bytes()
         if b"hull.jit import" in text:
             digest.update(text)
