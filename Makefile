@@ -9,6 +9,9 @@
 
 BIN := .venv/bin
 
+# As many processes run as there are cores: threads of linear algebra in each would fight.
+pytest quick soak bench theory hard-cases: export OPENBLAS_NUM_THREADS = 1
+
 .PHONY: demo test check pytest quick soak bench theory hard-cases lock setup clean
 
 demo: setup
@@ -25,7 +28,7 @@ check: setup
 # Files of tests side by side; one file stays with one process, so that fixtures are made once.
 # Property tests are asked the same examples in every run, on every machine.
 pytest: setup
-	$(BIN)/pytest -n auto --dist loadfile --benchmark-disable
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable
 
 quick: setup
 	$(BIN)/pytest -q -n auto --dist loadfile --benchmark-disable --quick
@@ -36,14 +39,14 @@ soak: setup
 	@RUNS="$(RUNS)" SEED="$(SEED)" TESTS="$(TESTS)" bash .ci/soak
 
 bench: setup
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/results.py $(ONLY)
+	$(BIN)/python tests/benchmarks/results.py $(ONLY)
 
 theory: setup
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/benchmarks/bench_theory.py --processes 2 \
+	$(BIN)/python tests/benchmarks/bench_theory.py --processes 2 \
 		-o data/pictures/theory.png
 
 hard-cases: setup
-	PYTHONPATH=tests OPENBLAS_NUM_THREADS=1 $(BIN)/python -m helpers.hard_cases_table
+	PYTHONPATH=tests $(BIN)/python -m helpers.hard_cases_table
 
 lock: setup
 	$(BIN)/python -m pip install --quiet uv

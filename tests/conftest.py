@@ -52,7 +52,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)  # once hypothesis has marked what it draws
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With --quick leave out what takes long, recordings, drawn examples, and all but one case."""
+    """Begin with the files that take longest, lest one process be left with them at the end.
+
+    With --quick leave out what takes long, recordings, drawn examples, and all but one case.
+    """
+    long = {item.path for item in items if item.get_closest_marker("recording")}
+    items.sort(key=lambda item: item.path not in long)
     if not config.getoption("--quick"):
         return
     quick: dict[str, pytest.Item] = {}

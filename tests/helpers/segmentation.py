@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.capture import evidence as room
 from hybridve.hull.capture import segment
 from hybridve.hull.capture.background import Background
 from hybridve.hull.capture.segment import SegmentSettings
@@ -51,7 +52,7 @@ def evidence_reference(
     trusted = trust_around > 0
     smooth = np.divide(shade_around, trust_around, out=np.zeros_like(shade), where=trusted)
     texture2 = np.where(
-        trusted, (shade - smooth) ** 2 * norm2 / (1 + segment._SHADE_VARIES**2 * norm2), 0.0
+        trusted, (shade - smooth) ** 2 * norm2 / (1 + room._SHADE_VARIES**2 * norm2), 0.0
     )
 
     # An object may have any colour: the noisier a pixel, the more colours it covers by itself.
@@ -63,14 +64,14 @@ def evidence_reference(
     evidence = np.minimum(misfit2 / 2 - bar, (colour2 + texture2) / 2 - shadow_bar)
 
     # Objects have a few colours: those that pixels beyond doubt show are likelier elsewhere.
-    box = (image >> segment._COLOUR_SHIFT).astype(np.int64) @ np.array([256, 16, 1])
-    certain = evidence > segment._BEYOND_DOUBT
-    counts = np.bincount(box[certain], minlength=segment._N_COLOURS)
+    box = (image >> room._COLOUR_SHIFT).astype(np.int64) @ np.array([256, 16, 1])
+    certain = evidence > room._BEYOND_DOUBT
+    counts = np.bincount(box[certain], minlength=room._N_COLOURS)
     n_certain = counts.sum()
-    weight = segment._COLOUR_WEIGHT * n_certain / (n_certain + segment._COLOUR_PIXELS)
-    share = counts / max(n_certain, 1) * segment._N_COLOURS
+    weight = room._COLOUR_WEIGHT * n_certain / (n_certain + room._COLOUR_PIXELS)
+    share = counts / max(n_certain, 1) * room._N_COLOURS
     evidence = evidence + np.log(weight * share + 1 - weight)[box]
-    limit = segment._EVIDENCE_LIMIT
+    limit = room.EVIDENCE_LIMIT
     evidence = np.clip(evidence, -limit, limit)
 
     # A value that the gain takes out of the range of bytes was saturated, and says no more than the
@@ -82,6 +83,6 @@ def evidence_reference(
 
 def window_sum(values: Reals) -> Reals:
     """Return the sum over the square window around each pixel, nothing beyond the image."""
-    side = 2 * segment._SHADE_REACH_PX + 1
+    side = 2 * room.SHADE_REACH_PX + 1
     kernel = np.ones((side, side))
     return np.asarray(cv2.filter2D(values, -1, kernel, borderType=cv2.BORDER_CONSTANT))
