@@ -1,6 +1,6 @@
 # make demo    the whole job on a generated session
 # make test    everything that must hold: style, types, import contracts, tests
-# make quick   a minute of the tests: of each one that is quick the first case
+# make quick   some 100 s of the tests: of each one that is quick the first case
 # make soak    the property tests with new examples: RUNS=10 times, SEED=1 and up, TESTS=some files
 # make bench   the benchmarks at full size, into tests/benchmarks/results.json; ONLY="bench_query" some
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
