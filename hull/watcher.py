@@ -1,6 +1,6 @@
-"""What is told while something long runs; a terminal shows it, tests and scripts need not."""
+"""What is told while something long runs, whoever looks on."""
 
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import Protocol
 
 
@@ -32,22 +32,3 @@ class Watcher(Protocol):
     def warn(self, text: str) -> None:
         """Say what everybody should know, whether they look on or not."""
         ...
-
-
-class Nobody:
-    """A watcher whom nothing is shown."""
-
-    def stage(self, what: str, done: int, total: int) -> None:
-        """Show nothing."""
-
-    def steps(
-        self, what: str, total: int, *, done: int = 0, unit: str = "frame"
-    ) -> AbstractContextManager[Advance]:
-        """Show nothing."""
-        return nullcontext(lambda n=1: None)  # noqa: ARG005
-
-    def say(self, text: str) -> None:
-        """Show nothing."""
-
-    def warn(self, text: str) -> None:
-        """Show nothing."""

@@ -27,9 +27,6 @@ _TABLE_POINTS = 25
 #: eigenvalue of what they tell of it that the smallest must reach.
 _ONE_RAY = 1e-12
 
-#: Points of a pixel grid over an image, a side, for the error within the image.
-_IMAGE_POINTS = 9
-
 
 def parameter_slices(cameras: Sequence[Camera]) -> list[slice]:
     """Return where each camera's parameters stand in the covariance of a rig."""
