@@ -30,8 +30,10 @@ _KIND = "lenses"
 _VERSION = 2
 
 
-def _colmap_camera(camera: Camera) -> pycolmap.Camera:
+def as_colmap(camera: Camera, number: int = 1) -> pycolmap.Camera:
+    """Return a camera's lens as COLMAP's, which is called by a number; it holds no skew."""
     return pycolmap.Camera(
+        camera_id=number,
         model=camera.model,
         width=camera.width_px,
         height=camera.height_px,
@@ -78,14 +80,14 @@ def img_from_cam(camera: Camera, points_cam: NDArray[np.float64]) -> NDArray[np.
     if not camera.has_distortion:
         homogeneous = points_cam @ camera.pinhole.T
         return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
-    return np.asarray(_colmap_camera(camera).img_from_cam(np.ascontiguousarray(points_cam)))
+    return np.asarray(as_colmap(camera).img_from_cam(np.ascontiguousarray(points_cam)))
 
 
 def img_by_params(
     camera: Camera, params: NDArray[np.float64], points_cam: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the images (K, N, 2) of points (N, 3) for K sets of a lens's parameters, (K, P)."""
-    lens = _colmap_camera(camera)
+    lens = as_colmap(camera)
     points = np.ascontiguousarray(points_cam)
     images = np.zeros((len(params), len(points), 2))
     for index, values in enumerate(params):
@@ -99,7 +101,7 @@ def cam_from_img(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.floa
     if not camera.has_distortion:
         rays = np.linalg.solve(camera.pinhole, np.column_stack([pixels, np.ones(len(pixels))]).T).T
         return np.asarray(rays[:, :2])
-    return np.asarray(_colmap_camera(camera).cam_from_img(np.ascontiguousarray(pixels)))
+    return np.asarray(as_colmap(camera).cam_from_img(np.ascontiguousarray(pixels)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

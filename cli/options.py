@@ -249,6 +249,14 @@ def evaluation_of(
     )
 
 
+def refuse_suffix(picture: Path) -> None:
+    """Refuse a picture's name that says of no kind that can be drawn."""
+    from hybridve.hull.view.chart import SUFFIXES
+
+    if picture.suffix.lower() not in SUFFIXES:
+        raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
+
+
 def command_line() -> str:
     """Return what was called, for the files that it makes."""
     return " ".join(["hybridve", *sys.argv[1:]])

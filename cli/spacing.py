@@ -145,14 +145,13 @@ def spacing(
     from hybridve.hull.report.write import refuse_existing
     from hybridve.hull.spacing import SpacingRequest, find_spacing
     from hybridve.hull.spacing_picture import write_picture_of
-    from hybridve.hull.view.chart import SUFFIXES
 
     cv2.setNumThreads(1)
     terminal = Terminal(enabled=progress)
-    if picture is not None and picture.suffix.lower() not in SUFFIXES:
-        raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
-    if picture is not None and picture == output:
-        raise click.UsageError(f"{output} cannot be both spacing and picture")
+    if picture is not None:
+        options.refuse_suffix(picture)
+        if picture == output:
+            raise click.UsageError(f"{output} cannot be both spacing and picture")
     for path in (output, picture):
         if path is not None:
             refuse_existing(path, overwrite=overwrite)

@@ -59,10 +59,8 @@ def summary(report: Path, as_json: bool, picture: Path | None, overwrite: bool) 
 
 def _refuse_picture(picture: Path, *, overwrite: bool) -> None:
     from hybridve.hull.report.write import refuse_existing
-    from hybridve.hull.view.chart import SUFFIXES
 
-    if picture.suffix.lower() not in SUFFIXES:
-        raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
+    options.refuse_suffix(picture)
     refuse_existing(picture, overwrite=overwrite)
 
 

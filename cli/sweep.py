@@ -133,13 +133,11 @@ def sweep(
     from hybridve.hull.report.write import refuse_existing
     from hybridve.hull.sweep.picture import write_picture_of
     from hybridve.hull.sweep.session import SweepRequest, sweep_session
-    from hybridve.hull.view.chart import SUFFIXES
 
     cv2.setNumThreads(1)
     terminal = Terminal(enabled=progress)
     picture = output.with_suffix(".png") if picture is None else picture
-    if picture.suffix.lower() not in SUFFIXES:
-        raise click.UsageError(f"{picture}: pictures are {', '.join(SUFFIXES)}")
+    options.refuse_suffix(picture)
     if picture == output:
         raise click.UsageError(f"{output} cannot be both sweep and picture; give --picture a name")
     for path in (output, picture):

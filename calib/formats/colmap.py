@@ -7,6 +7,7 @@ import pycolmap
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.lens import as_colmap
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Rig
@@ -33,15 +34,7 @@ def write_colmap_model(folder: Path, rig: Rig) -> None:
                 f"camera {camera.name!r} has a skew of {camera.skew_px:.3g} px, which no COLMAP "
                 "model holds; write rig.json only"
             )
-        model.add_camera(
-            pycolmap.Camera(
-                camera_id=number,
-                model=camera.model,
-                width=camera.width_px,
-                height=camera.height_px,
-                params=camera.params,
-            )
-        )
+        model.add_camera(as_colmap(camera, number))
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
         if number == 1:
             colmap_rig.add_ref_sensor(sensor)

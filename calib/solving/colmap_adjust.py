@@ -18,6 +18,7 @@ import numpy as np
 import pycolmap
 
 from hybridve.calib.boards.board import is_seen
+from hybridve.calib.lens import as_colmap
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.bundle import Bundle, BundleView, total_cost
 
@@ -99,15 +100,7 @@ def _add_cameras(model: pycolmap.Reconstruction, bundle: Bundle) -> None:
     """Put lenses into a model, and the rig of all cameras; its frame is that of the first."""
     rig, anchor = pycolmap.Rig(rig_id=1), bundle.cameras[0].cam_from_world
     for number, camera in enumerate(bundle.cameras, start=1):
-        model.add_camera(
-            pycolmap.Camera(
-                camera_id=number,
-                model=camera.model,
-                width=camera.width_px,
-                height=camera.height_px,
-                params=camera.params,
-            )
-        )
+        model.add_camera(as_colmap(camera, number))
         if number == 1:
             rig.add_ref_sensor(_sensor(number))
         else:
