@@ -252,7 +252,7 @@ def _synchronised(
             'board that is moved about, or say sync = "given"'
         )
     lenses = _fit_lenses(boards, observations, settings.lens, requests, _no_progress)
-    clocks = estimate_offsets(boards, lenses, observations)
+    clocks = estimate_offsets(boards, [lens.camera for lens in lenses], observations)
     if any(known for name, known in clocks.is_known.items() if name != clocks.reference):
         # A lens that one camera tells alone is a little wrong, and bends the board's path in time.
         # All cameras together, once they agree, tell lenses better, and these the offsets.
@@ -264,7 +264,7 @@ def _synchronised(
             replace(lens, camera=replace(camera, cam_from_world=lens.camera.cam_from_world))
             for lens, camera in zip(lenses, rough.bundle.cameras, strict=True)
         ]
-        clocks = estimate_offsets(boards, lenses, observations)
+        clocks = estimate_offsets(boards, [lens.camera for lens in lenses], observations)
     for note in clocks.notes:
         logger.warning("clocks: %s; it is taken to be in time", note)
     for name, instants in clocks.left_out.items():

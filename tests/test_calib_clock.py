@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.boards import make_camera
-from helpers.recorded_boards import ExactLens, Recording, row_of_cameras, see
+from helpers.recorded_boards import Recording, row_of_cameras, see
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -73,12 +73,11 @@ def out_of_time(
                 image = f"board clip, frame {frame}"
                 sightings.append(Sighting(image, frame, 0, (pixels + noise)[turn]))
         observations.append(Observations(camera.name, model, (640, 480), tuple(sightings), False))
-    lenses = [ExactLens(replace(c, cam_from_world=np.eye(3, 4)), {}, {}) for c in cameras]
-    return Recording([board], lenses, observations, cameras)
+    return Recording([board], [], observations, cameras)
 
 
 def estimate(recording: Recording) -> Clocks:
-    return estimate_offsets(recording.boards, recording.lenses, recording.observations)
+    return estimate_offsets(recording.boards, recording.cameras, recording.observations)
 
 
 def test_offsets_are_found_to_a_fraction_of_a_frame() -> None:
@@ -227,7 +226,7 @@ def test_a_still_clip_tells_nothing() -> None:
     recording = out_of_time({"cam1": 0.0, "cam2": 1.0})
     still = [replace(seen, is_still=True) for seen in recording.observations]
 
-    clocks = estimate_offsets(recording.boards, recording.lenses, still)
+    clocks = estimate_offsets(recording.boards, recording.cameras, still)
 
     assert not clocks.is_known["cam2"]
     assert "lie still" in clocks.notes[0]
@@ -240,7 +239,7 @@ def test_clips_without_common_frames_tell_nothing() -> None:
 
     clocks = estimate_offsets(
         recording.boards,
-        recording.lenses,
+        recording.cameras,
         [recording.observations[0], replace(seen, sightings=later)],
     )
 

@@ -10,13 +10,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.boards.board import Observations
+from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.looks import (
     DISAGREE,
     Look,
-    NamedBoard,
     SolvedLens,
     inverses,
     locate,
@@ -59,7 +58,7 @@ class Chain:
 
     def __init__(
         self,
-        boards: Sequence[NamedBoard],
+        boards: Sequence[Board],
         cameras: Sequence[Camera],
         looks: Sequence[Look],
     ) -> None:
@@ -78,7 +77,7 @@ class Chain:
     @classmethod
     def of(
         cls,
-        boards: Sequence[NamedBoard],
+        boards: Sequence[Board],
         lenses: Sequence[SolvedLens],
         observations: Sequence[Observations],
         is_labelled: bool,

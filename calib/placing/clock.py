@@ -19,7 +19,6 @@ Robotics 32(2), 2016 (the offset as one more parameter of the adjustment).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -34,15 +33,6 @@ from hybridve.calib.placing.board_tracks import (
 )
 from hybridve.calib.placing.clock_problem import KNOWN_FRAMES, MIN_MOTION, MIN_TELLING, ClockProblem
 from hybridve.calib.placing.clock_start import MAX_OFFSET_FRAMES, located, start_of
-
-
-class SolvedLens(Protocol):
-    """What is needed of a lens that was fitted to the views of one camera."""
-
-    @property
-    def camera(self) -> Camera:
-        """The lens; its pose is not used."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +69,7 @@ class Clocks:
 
 def estimate_offsets(
     boards: Sequence[Board],
-    lenses: Sequence[SolvedLens],
+    cameras: Sequence[Camera],
     observations: Sequence[Observations],
     max_offset_frames: int = MAX_OFFSET_FRAMES,
 ) -> Clocks:
@@ -89,8 +79,8 @@ def estimate_offsets(
     ----------
     boards : sequence of Board
         The boards.
-    lenses : sequence of SolvedLens
-        The lenses of the cameras.
+    cameras : sequence of Camera
+        The lenses; their poses are not used.
     observations : sequence of Observations
         What the same cameras saw, in order of their names; every frame of the clip, so that
         neighbours can be interpolated.
@@ -107,7 +97,6 @@ def estimate_offsets(
     if any(seen.is_still for seen in observations):
         notes |= dict.fromkeys(range(1, n_cameras), "the boards lie still in the clip")
     elif n_cameras > 1:
-        cameras = [lens.camera for lens in lenses]
         tracks = [tracks_of(seen.sightings) for seen in observations]
         spacing = spacing_of(tracks)
         tracks = [listed_alike(boards, track, spacing) for track in tracks]

@@ -22,13 +22,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.boards.board import Observations, is_seen
+from hybridve.calib.boards.board import Board, Observations, is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.placing.chain import Chain
 from hybridve.calib.placing.looks import (
     DISAGREE,
     Look,
-    NamedBoard,
     SolvedLens,
     corner_residuals,
     placed_by,
@@ -84,7 +83,7 @@ class Linked:
 
 
 def link_cameras(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     lenses: Sequence[SolvedLens],
     observations: Sequence[Observations],
     is_labelled: bool,
@@ -93,7 +92,7 @@ def link_cameras(
 
     Parameters
     ----------
-    boards : sequence of NamedBoard
+    boards : sequence of Board
         The boards, in order of name; `Sighting.board` counts them.
     lenses : sequence of SolvedLens
         The lenses of the cameras, and where the boards lay in the views they were fitted to. Other

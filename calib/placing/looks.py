@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Board, Sighting, is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.placing.moments import Moment, OnBody
+from hybridve.calib.placing.moments import Moment
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.lens_judge import view_label
 from hybridve.calib.solving.locate import locate_board
@@ -18,10 +18,6 @@ from hybridve.calib.solving.locate import locate_board
 #: Common views that differ by more than this (radians plus shares of the board's distance, median)
 #: share no relative pose.
 DISAGREE = 0.2
-
-
-class NamedBoard(Board, OnBody, Protocol):
-    """A board that may be mounted on a body together with others."""
 
 
 class SolvedLens(Protocol):
@@ -70,7 +66,7 @@ class Look:
 
 
 def locate(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     lens: SolvedLens,
     camera: int,
     sighting: Sighting,
@@ -100,7 +96,7 @@ def locate(
 
 
 def corner_residuals(
-    camera: Camera, cam_from_board: Pose, board: NamedBoard, pixels: NDArray[np.float64]
+    camera: Camera, cam_from_board: Pose, board: Board, pixels: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return observed minus projected, (S, 2) pixels, of the points that were seen.
 

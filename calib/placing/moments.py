@@ -1,7 +1,8 @@
 """When boards were seen, and what a pose is of: the keys by which views are put together."""
 
 from dataclasses import dataclass
-from typing import Protocol
+
+from hybridve.calib.boards.board import Board
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -54,21 +55,7 @@ class Body:
     name: str
 
 
-class OnBody(Protocol):
-    """What is needed of a board to tell its body."""
-
-    @property
-    def name(self) -> str:
-        """Its name, unique among the boards."""
-        ...
-
-    @property
-    def body(self) -> str | None:
-        """The rigid body that it sits on; None: it moves alone."""
-        ...
-
-
-def body_of(board: OnBody) -> Body:
+def body_of(board: Board) -> Body:
     """Return the body that a board sits on."""
     return Body(False, board.name) if board.body is None else Body(True, board.body)
 

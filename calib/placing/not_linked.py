@@ -5,9 +5,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.boards.board import Board
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.chain import Chain, Join, Part
-from hybridve.calib.placing.looks import DISAGREE, NamedBoard, inverses, products
+from hybridve.calib.placing.looks import DISAGREE, inverses, products
 from hybridve.calib.placing.moments import Moment
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.solving.consensus import common_pose
@@ -125,7 +126,7 @@ def _contradiction(chain: Chain, main: Part, part: Part, join: Join) -> Calibrat
 def _mirrored_error(chain: Chain, main: Part, part: Part) -> float | None:
     """Return how far common views disagree if the pictures of a part are flipped in x."""
     best = None
-    mirrors: list[Callable[[NamedBoard], NDArray[np.float64]]] = [_mirror_x, _mirror_y, _mirror_z]
+    mirrors: list[Callable[[Board], NDArray[np.float64]]] = [_mirror_x, _mirror_y, _mirror_z]
     for mirror in mirrors:
         measured, weights = [], []
         for boards in chain.board_parts:
@@ -158,15 +159,15 @@ def _unmirrored(cam_from_board: Pose, mirror: NDArray[np.float64]) -> Pose:
     return np.column_stack([rotation, shift])
 
 
-def _mirror_x(board: NamedBoard) -> NDArray[np.float64]:
+def _mirror_x(board: Board) -> NDArray[np.float64]:
     return np.column_stack([np.diag([-1.0, 1.0, 1.0]), board.center_board * [2.0, 0.0, 0.0]])
 
 
-def _mirror_y(board: NamedBoard) -> NDArray[np.float64]:
+def _mirror_y(board: Board) -> NDArray[np.float64]:
     return np.column_stack([np.diag([1.0, -1.0, 1.0]), board.center_board * [0.0, 2.0, 0.0]])
 
 
-def _mirror_z(board: NamedBoard) -> NDArray[np.float64]:
+def _mirror_z(board: Board) -> NDArray[np.float64]:
     """Return the mirror that leaves each point: markers name the points of a mirrored picture."""
     del board
     return np.column_stack([np.diag([1.0, 1.0, -1.0]), np.zeros(3)])

@@ -6,11 +6,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.boards.board import Observations, is_seen
+from hybridve.calib.boards.board import Board, Observations, is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
-from hybridve.calib.placing.looks import NamedBoard, SolvedLens, corner_residuals
+from hybridve.calib.placing.looks import SolvedLens, corner_residuals
 from hybridve.calib.pose import Pose
 from hybridve.calib.solving.locate import locate_board, rms
 
@@ -33,7 +33,7 @@ _SAME_PICTURE_PX = 1e-6
 _ALIKE_PX = 1.0
 
 
-def refuse_copies(boards: Sequence[NamedBoard], observations: Sequence[Observations]) -> list[str]:
+def refuse_copies(boards: Sequence[Board], observations: Sequence[Observations]) -> list[str]:
     """Refuse two cameras whose corners are the same to the pixel; warn where they nearly are."""
     clips = [
         {(s.instant, s.board): s.pixels for s in seen.sightings if s.instant is not None}
@@ -74,7 +74,7 @@ def _largest_px(apart: NDArray[np.float64]) -> float:
 
 
 def refuse_exchanged(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     lenses: Sequence[SolvedLens],
     observations: Sequence[Observations],
 ) -> list[str]:
@@ -122,7 +122,7 @@ def refuse_exchanged(
 
 
 def _typical_error(
-    boards: Sequence[NamedBoard],
+    boards: Sequence[Board],
     camera: Camera,
     seen: Observations,
     what: str,
