@@ -2,7 +2,6 @@
 
 from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
 from pydantic import (
     BaseModel,
@@ -12,6 +11,7 @@ from pydantic import (
     model_validator,
 )
 
+from hybridve.calib.boards.markers import DICTIONARIES
 from hybridve.calib.camera import N_PARAMS
 
 #: What lengths of a rig calibrated elsewhere may be in; squares are those of the target.
@@ -55,7 +55,7 @@ class TargetTable(_Table):
         return None
 
     def table(self) -> dict[str, Any]:
-        """Return what was said of the board, for `hybridve.calib.boards.named.make_board`."""
+        """Return what `hybridve.calib.boards.named.make_board` makes the board from."""
         return self.model_dump(exclude_none=True)
 
 
@@ -142,7 +142,7 @@ class AprilGridTable(TargetTable):
         return self
 
     def table(self) -> dict[str, Any]:
-        """Return what was said of the board, the gap in millimetres."""
+        """Return what the board is made from; the gap is in millimetres."""
         said = super().table()
         spacing = said.pop("tag_spacing", None)
         if spacing is not None:
@@ -158,9 +158,8 @@ TARGETS: dict[str, type[ChessboardTable | CharucoTable | AprilGridTable]] = {
 
 
 def _check_dictionary(name: str) -> str:
-    known = sorted(key for key in dir(cv2.aruco) if key.startswith("DICT_"))
-    if name not in known:
-        raise ValueError(f"unknown dictionary {name!r}; one of {', '.join(known)}")
+    if name not in DICTIONARIES:
+        raise ValueError(f"unknown dictionary {name!r}; one of {', '.join(DICTIONARIES)}")
     return name
 
 
