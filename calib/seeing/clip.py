@@ -12,7 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.boards.board import Board, Detection, Effort, Sighting, is_seen
+from hybridve.calib.boards.board import (
+    Board,
+    Detection,
+    Effort,
+    Observations,
+    Sighting,
+    is_seen,
+)
 from hybridve.calib.boards.target import Chessboard, refine_corners
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import FrameSource
@@ -29,7 +36,7 @@ from hybridve.calib.seeing.search import (
     name_of,
     search_pictures,
 )
-from hybridve.calib.seeing.stills import Seen, notes_of, sightings_of, without_parts
+from hybridve.calib.seeing.stills import notes_of, sightings_of, without_parts
 
 logger = logging.getLogger(__name__)
 
@@ -57,14 +64,14 @@ class _Unseen:
         Whether anything did.
     tried : str
         How the average was searched.
-    faint : Seen or None
+    faint : Observations or None
         Boards that the average shows, and most single frames do not.
     """
 
     moves: bool
     changes: bool
     tried: str = ""
-    faint: Seen | None = None
+    faint: Observations | None = None
 
 
 class _Clip:
@@ -138,7 +145,7 @@ def _steady_sum(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint16]:
 
 def observe_clips(
     search: Search, cameras: Sequence[CameraInput], given: dict[str, Given]
-) -> list[Seen]:
+) -> list[Observations]:
     """Return what each camera saw of the boards in the clip, as its average or frame by frame."""
     sources = [camera.extrinsics for camera in cameras if camera.extrinsics is not None]
     # One step for all cameras: frames with the same number were taken at the same time.
@@ -156,7 +163,7 @@ def observe_clips(
     for done, job in enumerate(jobs, start=1):
         stills.append(job.result())
         search.report("board clips", done, len(jobs))
-    seen = [still for still in stills if isinstance(still, Seen)]
+    seen = [still for still in stills if isinstance(still, Observations)]
     if len(seen) == len(clips):
         return seen
     moves = any(isinstance(still, _Unseen) and still.moves for still in stills)
@@ -178,7 +185,7 @@ def observe_clips(
                 )
             looked_at[clip.camera.name] = found
             stills[index] = _still_in_frames(search, clip, found) or still
-        seen = [still for still in stills if isinstance(still, Seen)]
+        seen = [still for still in stills if isinstance(still, Observations)]
         if len(seen) == len(clips):
             return seen
     logger.info("the board moves in the clips: each frame is looked at")
@@ -198,7 +205,7 @@ def observe_clips(
     ]
 
 
-def _observe_still_clip(search: Search, clip: _Clip, given: Given) -> Seen | _Unseen:
+def _observe_still_clip(search: Search, clip: _Clip, given: Given) -> Observations | _Unseen:
     """Return the boards in the average of a clip, or that there are none or they move."""
     boards = search.boards
     by_hand = given.whole
@@ -261,22 +268,24 @@ def _observe_still_clip(search: Search, clip: _Clip, given: Given) -> Seen | _Un
         tried = "; ".join(dict.fromkeys(detection.how for detection in found.values()))
         return _Unseen(False, changes, tried)
     known_px = [spread_px for spread_px in spreads_px.values() if spread_px is not None]
-    seen = Seen(
+    seen = Observations(
+        clip.camera.name,
+        clip.camera.model,
         clip.size_px,
         tuple(Sighting(CLIP, 0, number, pixels) for number, pixels in corners.items()),
+        True,
+        picture=clip.picture,
         how="; ".join(f"{name_of(boards, number)}: {how}" for number, how in hows.items())
         if len(boards) > 1
         else hows[0],
-        notes=tuple(notes),
-        is_still=True,
-        picture=clip.picture,
         spread_px=max(known_px) if known_px else None,
         hand_look=min(hand_looks)[2] if hand_looks else None,
+        notes=tuple(notes),
     )
     return _Unseen(False, True, faint=seen) if np.inf in strays_px else seen
 
 
-def _still_in_frames(search: Search, clip: _Clip, found: Found) -> Seen | None:
+def _still_in_frames(search: Search, clip: _Clip, found: Found) -> Observations | None:
     """Return boards that lie where single frames show them; None if they move.
 
     Somebody may stand before a board for so long that the average does not show it.
@@ -296,14 +305,16 @@ def _still_in_frames(search: Search, clip: _Clip, found: Found) -> Seen | None:
         strays_px += [_stray_px(corners, middles[board]) for corners in listed]
     if max(strays_px) > search.settings.still_px:
         return None
-    return Seen(
+    return Observations(
+        clip.camera.name,
+        clip.camera.model,
         clip.size_px,
         tuple(Sighting(CLIP, 0, board, corners) for board, corners in middles.items()),
-        how=f"detected in {len(found.with_board)} of {len(found.sizes)} frames, not in the average",
-        notes=tuple(notes),
-        is_still=True,
+        True,
         picture=clip.picture,
+        how=f"detected in {len(found.with_board)} of {len(found.sizes)} frames, not in the average",
         spread_px=float(np.median(strays_px)),
+        notes=tuple(notes),
     )
 
 
@@ -449,7 +460,7 @@ def _search_clip(search: Search, clip: _Clip, given: dict[str, Given]) -> Found:
     return found
 
 
-def _moving_clip(search: Search, clip: _Clip, found: Found) -> Seen:
+def _moving_clip(search: Search, clip: _Clip, found: Found) -> Observations:
     if not found.with_board:
         raise CalibrationError(
             f"camera {clip.camera.name!r}: {listed_boards(search.boards)} found in any of "
@@ -463,4 +474,7 @@ def _moving_clip(search: Search, clip: _Clip, found: Found) -> Seen:
             f"camera {clip.camera.name!r}: the pictures of {clip.source.label} differ in size"
         )
     how = f"detected in {len(found.with_board)} of {len(found.sizes)} frames"
-    return Seen(sizes.pop(), sightings, how=how, notes=notes)
+    camera = clip.camera
+    return Observations(
+        camera.name, camera.model, sizes.pop(), sightings, False, how=how, notes=notes
+    )

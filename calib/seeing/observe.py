@@ -9,6 +9,7 @@ that a second run decodes no picture.
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 from hybridve.calib.boards.board import Board, Observations
@@ -20,7 +21,7 @@ from hybridve.calib.seeing.corner_cache import CornerCache
 from hybridve.calib.seeing.given import given_corners
 from hybridve.calib.seeing.inputs import AUTO_MODEL, CameraInput, ObserveSettings, Progress
 from hybridve.calib.seeing.search import Search, describe_board, name_of
-from hybridve.calib.seeing.stills import Seen, observe_stills
+from hybridve.calib.seeing.stills import observe_stills
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ def observe_boards(
         clips = observe_clips(search, cameras, given)
         stills = [observe_stills(search, camera, given[camera.name]) for camera in cameras]
     return [
-        _observations(camera, still, clip)
+        _put_together(camera, still, clip)
         for camera, still, clip in zip(cameras, stills, clips, strict=True)
     ]
 
@@ -105,7 +106,7 @@ def find_boards(
     with Search(boards, settings, progress or _no_progress, cache) as search:
         given = {camera.name: given_corners(boards, camera) for camera in seeing}
         clips = observe_clips(search, seeing, given)
-    return [_observations(camera, None, clip) for camera, clip in zip(seeing, clips, strict=True)]
+    return [_put_together(camera, None, clip) for camera, clip in zip(seeing, clips, strict=True)]
 
 
 def _no_progress(what: str, done: int, total: int) -> None:
@@ -148,28 +149,27 @@ def _check_inputs(cameras: Sequence[CameraInput]) -> None:
             )
 
 
-def _observations(camera: CameraInput, stills: Seen | None, clip: Seen) -> Observations:
+def _put_together(
+    camera: CameraInput, stills: Observations | None, clip: Observations
+) -> Observations:
+    """Return what was seen in stills, where there are any, and in the clip."""
     if stills is not None and stills.size_px != clip.size_px:
         raise CalibrationError(
             "camera {!r}: intrinsics are {}x{} pixels, extrinsics {}x{}; record both in the same "
             "mode".format(camera.name, *stills.size_px, *clip.size_px)
         )
-    own = stills or Seen(clip.size_px, ())
-    notes = own.notes + clip.notes
-    for note in notes:
+    seen = clip
+    if stills is not None:
+        seen = replace(
+            clip,
+            sightings=stills.sightings + clip.sightings,
+            missed=stills.missed,
+            notes=stills.notes + clip.notes,
+        )
+    for note in seen.notes:
         logger.info("camera %s: %s", camera.name, note)
-    return Observations(
-        camera.name,
-        camera.model,
-        clip.size_px,
-        own.sightings + clip.sightings,
-        clip.is_still,
-        missed=own.missed,
-        picture=clip.picture,
-        how=clip.how,
-        spread_px=clip.spread_px,
-        hand_look=clip.hand_look,
-        notes=notes,
+    return replace(
+        seen,
         sources={
             "intrinsics": camera.intrinsics.label if camera.intrinsics else None,
             "extrinsics": camera.extrinsics.label if camera.extrinsics else None,

@@ -3,14 +3,12 @@
 import logging
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from itertools import combinations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from hybridve.calib.boards.board import Board, Detection, Sighting, is_seen
+from hybridve.calib.boards.board import Board, Detection, Observations, Sighting, is_seen
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import FrameSource
@@ -21,22 +19,7 @@ from hybridve.calib.seeing.search import Choice, Found, Search, length_of, name_
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """Stills or a clip of one camera, as they go into its `Observations`."""
-
-    size_px: tuple[int, int]
-    sightings: tuple[Sighting, ...]
-    how: str = ""
-    notes: tuple[str, ...] = ()
-    missed: dict[str, str] = field(default_factory=dict)
-    is_still: bool = False
-    picture: NDArray[np.float32] | None = None
-    spread_px: float | None = None
-    hand_look: int | None = None
-
-
-def observe_stills(search: Search, camera: CameraInput, given: Given) -> Seen | None:
+def observe_stills(search: Search, camera: CameraInput, given: Given) -> Observations | None:
     """Return what the stills of a camera show of the boards; None if there are none of its own."""
     source = camera.intrinsics
     if source is None or serves_as_stills(camera):
@@ -83,7 +66,9 @@ def observe_stills(search: Search, camera: CameraInput, given: Given) -> Seen | 
             missed[names[index]] = "no board found"
     fitting = {index: names[index] for index in names if names[index] not in missed}
     sightings, notes = sightings_of(search.boards, found, fitting, False)
-    return Seen(size_px, sightings, notes=notes, missed=missed)
+    return Observations(
+        camera.name, camera.model, size_px, sightings, False, missed=missed, notes=notes
+    )
 
 
 def _names_of_images(source: FrameSource, indices: Iterable[int]) -> dict[int, str]:
