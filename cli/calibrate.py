@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hybridve.calib.lengths import millimetres
 from hybridve.cli import options
 from hybridve.cli.progress import Terminal
 
@@ -280,8 +281,6 @@ def _write_certificate(
 
 def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
     """Leave with a status of its own if the error is not proved to be small enough."""
-    from hybridve.calib.judging.certificate import millimetres
-
     error_m = math.nan if certificate is None or certificate.doubts else certificate.error95_m
     if error_m <= max_error_m:
         return
@@ -342,7 +341,7 @@ def _distances_m(rig: "Rig") -> dict[str, float]:
 
 
 def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
-    from hybridve.calib.judging.certificate import millimetres, opinion_text
+    from hybridve.calib.judging.certificate import opinion_text
 
     record = _record_of(rig)
     if certificate is not None:

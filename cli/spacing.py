@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hybridve.calib.lengths import mm
 from hybridve.cli import options
 from hybridve.cli.progress import Terminal
 
@@ -239,7 +240,7 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
     start_m, stop_m = (float(curve.shift_m[end]) for end in (0, -1))
     text = {
         "smallest shift": _answer(one.shift_m, start_m, stop_m),
-        "it is at least": "-" if math.isnan(one.at_least_m) else _mm(one.at_least_m),
+        "it is at least": "-" if math.isnan(one.at_least_m) else mm(one.at_least_m, ".1f"),
         "suffices at 95 %": "",
         "at 95 % decided by": "",
         "kept at": _ranges(one),
@@ -258,7 +259,7 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
             "at object": binding.object_name,
             "hull point": _point(binding.on_hull_world),
             "object point": _point(binding.on_object_world),
-            "clearance there": f"{_mm(low_m)} to {_mm(high_m)}",
+            "clearance there": f"{mm(low_m, '.1f')} to {mm(high_m, '.1f')}",
         }
         if math.isnan(one.shift_m):
             text["clearance there"] += f", at {1e3 * stop_m:g}"
@@ -266,7 +267,7 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
         text["suffices at 95 %"] = _answer(one.doubt.shift_m, start_m, stop_m)
         if one.doubt.frame is not None:
             text["at 95 % decided by"] = (
-                f"frame {one.doubt.frame}, there known to +- {_mm(one.doubt.std_m)}"
+                f"frame {one.doubt.frame}, there known to +- {mm(one.doubt.std_m, '.1f')}"
             )
     n_valid = frames.n_valid
     ends = ((0, start_m), (-1, stop_m))
@@ -287,12 +288,12 @@ def _answer(shift_m: float, start_m: float, stop_m: float) -> str:
     """Return a shift that was sought in a range, or that there is none."""
     if math.isnan(shift_m):
         return f"none up to {1e3 * stop_m:g}"
-    return _mm(shift_m) + (" (the first)" if shift_m == start_m else "")
+    return mm(shift_m, ".1f") + (" (the first)" if shift_m == start_m else "")
 
 
 def _ranges(one: "SessionSpacing") -> str:
     """Return where the clearance is kept, in ascending order."""
-    ranges = [f"{_mm(low)} to {_mm(high)}" for low, high in one.free_m.tolist()]
+    ranges = [f"{mm(low, '.1f')} to {mm(high, '.1f')}" for low, high in one.free_m.tolist()]
     if len(ranges) > _MOST_RANGES:
         ranges = [*ranges[:_MOST_RANGES], f"{len(one.free_m) - _MOST_RANGES} more"]
     return "; ".join(ranges) or "-"
@@ -316,10 +317,6 @@ def _standing_text(found: "Spacing") -> str:
 def _count(violated: int, undecided: int, total: int) -> str:
     may = f" to {violated + undecided}" if undecided else ""
     return f"{violated}{may} of {total}"
-
-
-def _mm(metres: float) -> str:
-    return f"{1e3 * metres:.1f}"
 
 
 def _point(point_world: Any) -> str:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hybridve.calib.lengths import mm
 from hybridve.cli import options
 
 if TYPE_CHECKING:
@@ -169,8 +170,8 @@ def _print_clearances(objects: list[dict[str, Any]]) -> None:
                 "-" if nearest is None else f"{nearest['time_s']:.2f} s",
                 "-"
                 if nearest is None or nearest["at_least_95_m"] is None
-                else f"at least {_mm(nearest['at_least_95_m'])}",
-                _mm(found["required_clearance_m"]) if found["required_clearance_m"] else "-",
+                else f"at least {mm(nearest['at_least_95_m'])}",
+                mm(found["required_clearance_m"]) if found["required_clearance_m"] else "-",
                 _below_text(found),
                 "-" if depth is None else _bounds_text(depth["lower_m"], depth["upper_m"]),
                 _recovery_text(recovery),
@@ -186,7 +187,7 @@ def _recovery_text(recovery: dict[str, Any] | None) -> str:
     no_exit = f"no exit in {options.counted(recovery['frames_no_exit'], 'frame')}"
     if recovery["d_rec_m"] is None:
         return no_exit
-    longest = _mm(recovery["d_rec_m"])
+    longest = mm(recovery["d_rec_m"])
     return f"{longest}, {no_exit}" if recovery["frames_no_exit"] else longest
 
 
@@ -231,7 +232,7 @@ def _warnings(found: dict[str, Any]) -> list[str]:
     recovery = found["recovery"]
     if recovery is not None and recovery["frames_asked_to_free"]:
         asked, shift_m = recovery["frames_asked_to_free"], recovery["free_shift_m"]
-        whole = f"{_mm(shift_m)} mm along V_rec do in all" if shift_m is not None else "none does"
+        whole = f"{mm(shift_m)} mm along V_rec do in all" if shift_m is not None else "none does"
         if recovery["frames_freed"] < asked:
             lines.append(
                 f"moving it by D_rec frees all of it in {recovery['frames_freed']} of "
@@ -252,15 +253,11 @@ def _speed_text(lower_m_s: float | None, upper_m_s: float | None) -> str:
     return f", coming at {lower} m/s" if lower == upper else f", coming at {lower}-{upper} m/s"
 
 
-def _mm(length_m: float) -> str:
-    return f"{1e3 * length_m:.2f}"
-
-
 def _bounds_text(lower_m: float, upper_m: float | None) -> str:
     """Return bounds in millimetres; None above stands for no hull anywhere near."""
     if upper_m is None:
-        return f"beyond {_mm(lower_m)}"
-    return _mm(lower_m) if upper_m == lower_m else f"{_mm(lower_m)}-{_mm(upper_m)}"
+        return f"beyond {mm(lower_m)}"
+    return mm(lower_m) if upper_m == lower_m else f"{mm(lower_m)}-{mm(upper_m)}"
 
 
 def _below_text(found: dict[str, Any]) -> str:

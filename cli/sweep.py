@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
+from hybridve.calib.lengths import mm
 from hybridve.cli import options
 from hybridve.cli.progress import Terminal
 
@@ -176,13 +177,14 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
     found = sweep_as_dict(sweep)
     truth = found["truth"]
     click.echo(f"{output}, {picture}: {len(found['frames'])} frames {sweep.settings['frames']}")
-    finest = f"sampled every {_mm(truth['spacing_m'])} mm"
+    finest = f"sampled every {mm(truth['spacing_m'], '.3g')} mm"
     if (truth["spacing_m"] or 0.0) > (truth["spacing_wanted_m"] or 0.0):
-        finest += f" ({_mm(truth['spacing_wanted_m'])} were wanted, but are too many)"
+        finest += f" ({mm(truth['spacing_wanted_m'], '.3g')} were wanted, but are too many)"
     left_open = "none is left open"
     if truth["triangles_open"]:
         left_open = (
-            f"{truth['triangles_open']} are left open (no disc of {_mm(truth['open_most_m'])} mm)"
+            f"{truth['triangles_open']} are left open "
+            f"(no disc of {mm(truth['open_most_m'], '.3g')} mm)"
         )
     click.echo(
         f"  truth: {truth['triangles_colliding']} of {truth['triangles_asked']} triangles asked "
@@ -220,10 +222,10 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
                     f"{row['points']:.0f}",
                     "-" if missed is None else f"{row['triangles_missed']} ({100 * missed:.2g} %)",
                     "-" if missed is None else f"{row['objects_missed']}",
-                    _mm(row["distance_max_m"]),
-                    _mm(row["distance_p99_m"]),
-                    _mm(row["distance_median_m"]),
-                    _mm(row["predicted_near_m"]),
+                    mm(row["distance_max_m"], ".3g"),
+                    mm(row["distance_p99_m"], ".3g"),
+                    mm(row["distance_median_m"], ".3g"),
+                    mm(row["predicted_near_m"], ".3g"),
                     _share(row["within_predicted"]),
                     "*" if row["on_front"] else "",
                 )
@@ -235,10 +237,6 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
         f"{stage} {ms['median']:.2f} ({ms['iqr']:.2g})" for stage, ms in found["stage_ms"].items()
     )
     click.echo(f"  once a frame, ms, median over the frames (IQR): {stages}")
-
-
-def _mm(metres: float | None) -> str:
-    return "-" if metres is None else f"{1e3 * metres:.3g}"
 
 
 def _share(share: float | None) -> str:

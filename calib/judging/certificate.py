@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.judging.twins import find_twins, twins_text
+from hybridve.calib.lengths import millimetres
 from hybridve.calib.lens import cam_from_img, parameter_names
 from hybridve.calib.pose import invert, transform
 from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion, SecondOpinion
@@ -554,11 +555,6 @@ def opinion_text(opinion: SecondOpinion | NoOpinion) -> str:
         "deviations of its error, which is "
         f"{millimetres(opinion.expected95_m)} mm (95 %)"
     )
-
-
-def millimetres(length_m: float) -> str:
-    """Return a length in mm to two digits, as people write it: 0.33, 7.7, 56000."""
-    return f"{float(f'{1000 * length_m:.2g}'):.15g}"
 
 
 def _kind(parameter: str) -> str:

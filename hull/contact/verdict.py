@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from hybridve.calib.lengths import mm
+
 #: From the worst on. "clash": a point of the surface is in the hull, sampled or certified.
 #: "inside": the hull is in the closed object without touching its surface. "too near": the hull is
 #: certainly nearer than the required clearance. "unknown": the frame could not be evaluated, or its
@@ -71,27 +73,27 @@ def judge(facts: Facts) -> tuple[Verdict, str]:
     ('kept', '')
     """
     lower_m, upper_m = facts.clearance_m
-    required = f"{_mm(facts.required_m)} mm are required"
+    required = f"{mm(facts.required_m)} mm are required"
     if facts.touches:
         return "clash", ""
     if facts.is_inside:
         return "inside", "within the closed part, beneath its surface"
     if upper_m < facts.required_m:
-        return "too near", f"at most {_mm(upper_m)} mm away, {required}"
+        return "too near", f"at most {mm(upper_m)} mm away, {required}"
     if facts.share_seen == 0.0:
         return "not seen", "outside what the cameras can tell: no point of it can be in the hull"
     if not facts.is_sound:
         return "open", facts.rests_on
     if lower_m < facts.required_m:
-        return "open", f"between {_mm(lower_m)} and {_mm(upper_m)} mm away, {required}"
+        return "open", f"between {mm(lower_m)} and {mm(upper_m)} mm away, {required}"
     if math.isnan(lower_m) and facts.required_m > 0:
         return "open", f"the clearance was not measured, {required}"
     if facts.certificate == "open":
-        return "open", f"a contact less than {_mm(facts.open_at_m)} mm wide may hide"
+        return "open", f"a contact less than {mm(facts.open_at_m)} mm wide may hide"
     if facts.certificate != "free":
         return "open", "no sample collides, which proves nothing of what lies between them"
     if lower_m == 0.0:
-        return "open", f"at most {_mm(upper_m)} mm away, perhaps not at all"
+        return "open", f"at most {mm(upper_m)} mm away, perhaps not at all"
     if math.isnan(lower_m) and facts.is_closed:
         return "open", "its surface is free; whether something is wholly inside was not asked"
     words = [facts.rests_on] if facts.rests_on else []
@@ -110,7 +112,3 @@ def worst(verdicts: "set[str]") -> Verdict:
     'too near'
     """
     return next((verdict for verdict in VERDICTS if verdict in verdicts), "unknown")
-
-
-def _mm(length_m: float) -> str:
-    return f"{1e3 * length_m:.2f}"

@@ -47,7 +47,7 @@ def _environment() -> Environment:
         "degrees": math.degrees,
         "fixed": _fixed,
         "in_order": _in_order,
-        "mm": _mm,
+        "mm": _length,
         "number": number,
         "percent": _percent,
         "said": _said,
@@ -76,7 +76,7 @@ def _percent(share: float) -> str | Unknown:
     return f"{100 * share:.0f} %" if math.isfinite(share) else _UNKNOWN
 
 
-def _mm(length_m: float) -> str | Unknown:
+def _length(length_m: float) -> str | Unknown:
     return f"{number(1000 * length_m)} mm" if math.isfinite(length_m) else _UNKNOWN
 
 
