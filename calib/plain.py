@@ -1,13 +1,17 @@
-"""Dataclasses as JSON and back, so strictly that nothing is passed over in silence.
+"""Plain values: dataclasses and arrays as JSON has them, and dataclasses back from it.
 
-A dataclass becomes an object with its fields as keys. A field whose default is None is left out
-where it is None; all others must be there, of their type, and nothing else may be.
+Reading is so strict that nothing is passed over in silence. A dataclass becomes an object with its
+fields as keys. A field whose default is None is left out where it is None; all others must be
+there, of their type, and nothing else may be.
 """
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, ClassVar, TypeVar
+
+import numpy as np
 
 from hybridve.calib.errors import CalibrationError
 
@@ -26,7 +30,7 @@ class Told:
 
 
 def to_plain(value: Any) -> Any:
-    """Return dataclasses, mappings and sequences of plain values as JSON has them."""
+    """Return dataclasses, mappings, sequences and arrays as dicts, lists and Python's values."""
     if is_dataclass(value):
         return {
             one.name.removesuffix("_"): to_plain(getattr(value, one.name))
@@ -37,7 +41,26 @@ def to_plain(value: Any) -> Any:
         return {key: to_plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [to_plain(entry) for entry in value]
-    return value
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def to_json(value: Any) -> Any:
+    """Return what `to_plain` returns, with None for numbers that are not finite.
+
+    Examples
+    --------
+    >>> to_json({"range_m": np.array([0.5, np.inf])})
+    {'range_m': [0.5, None]}
+    """
+    return _finite(to_plain(value))
+
+
+def _finite(plain: Any) -> Any:
+    if isinstance(plain, dict):
+        return {key: _finite(entry) for key, entry in plain.items()}
+    if isinstance(plain, list):
+        return [_finite(entry) for entry in plain]
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 def read_strictly(kind: type[_T], told: Mapping[str, Any], where: str) -> _T:

@@ -157,6 +157,7 @@ def _check(
     session: "Session", source: Path, unit: str | None, terminal: Terminal, *, as_json: bool
 ) -> None:
     from hybridve.calib.formats.rigs import read_any_rig
+    from hybridve.calib.plain import to_json
     from hybridve.hull.capture.rig import board_sizes
     from hybridve.hull.capture.rig_check import check_session
 
@@ -166,7 +167,7 @@ def _check(
     rig = read_any_rig(source, unit=unit, image_size=image_size, names=names)
     check = check_session(session, rig, terminal.stage)
     if as_json:
-        click.echo(json.dumps(_plain({"rig": str(source), **asdict(check)})))
+        click.echo(json.dumps(to_json({"rig": str(source), **asdict(check)})))
     else:
         _print_check(source, check)
     if not check.is_trustworthy:
@@ -178,17 +179,6 @@ def _print_check(source: Path, check: "RigCheck") -> None:
     missed = ", ".join(f"{name} {rms_px:.2f}" for name, rms_px in check.rms_px.items())
     click.echo(f"  boards are missed by, px rms: {missed}")
     click.echo(f"  scale: {check.scale:.4f}")
-
-
-def _plain(value: Any) -> Any:
-    """Return plain JSON values: NaN, which JSON does not have, becomes null."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 # --- A rig that is made -----------------------------------------------------------------------
@@ -208,6 +198,7 @@ def _calibrate(
     from hybridve.calib.formats.colmap import write_colmap_model
     from hybridve.calib.formats.rig_json import write_rig
     from hybridve.calib.judging.certificate import SeenPoints, certify, working_volume
+    from hybridve.calib.plain import to_json
     from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
     from hybridve.hull.report.write import refuse_existing
 
@@ -233,7 +224,7 @@ def _calibrate(
     write_colmap_model(folder / "colmap", rig)
     write_rig(path, rig)
     if as_json:
-        click.echo(json.dumps(_plain(_numbers(path, rig, certificate))))
+        click.echo(json.dumps(to_json(_numbers(path, rig, certificate))))
     else:
         _print(path, rig, certificate)
     if max_error_m is not None:

@@ -152,7 +152,9 @@ def test_the_summary_counts_bounds_dates_and_names(path: Path) -> None:
     assert failing(summarize(read_report(path))) == ["box"]
 
 
-def only(frames: list[Finding], path: Path, required_m: float = 0.0) -> dict[str, Any]:
+def only(
+    frames: list[Finding], path: Path, required_m: float = 0.0, parts: frozenset[str] = frozenset()
+) -> dict[str, Any]:
     header = ReportHeader(
         run=machine.Run("", "", {}, ""),
         objects=({"name": "box", "required_clearance_m": required_m, "closed": True},),
@@ -160,7 +162,7 @@ def only(frames: list[Finding], path: Path, required_m: float = 0.0) -> dict[str
         rig={},
         engine="",
         renderer="",
-        parts=frozenset({"clearance", "doubt"}),
+        parts=frozenset({"clearance", "doubt"}) | parts,
         cameras=("cam1", "cam2"),
         meshes=(stored_mesh(FREE.body),),
     )
@@ -185,6 +187,16 @@ def test_the_nearest_frame_and_the_least_at_95_percent_may_be_different_ones(
     assert found["depth"] is None
     assert found["spans"] == []
     assert failing(numbers) == []
+
+
+@pytest.mark.parametrize("parts", [{"response"}, {"response", "recovery"}])
+def test_a_shift_that_nobody_asked_for_is_not_there(tmp_path: Path, parts: set[str]) -> None:
+    no_exit = deep(6.0, response=LOST, recovery=Recovery("", np.nan, np.nan))
+
+    (found,) = only([no_exit], tmp_path / "r.h5", parts=frozenset(parts))["objects"]
+
+    assert found["recovery"]["frames_asked_to_free"] == 0
+    assert found["recovery"]["free_shift_m"] is None
 
 
 def test_inside_alone_is_a_verdict_and_fails(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.judging.twins import find_twins, twins_text
 from hybridve.calib.lengths import millimetres
 from hybridve.calib.lens import cam_from_img, parameter_names
+from hybridve.calib.plain import to_json
 from hybridve.calib.pose import invert, transform
 from hybridve.calib.record import CalibrationRecord, Noise, NoOpinion, SecondOpinion
 from hybridve.calib.rig import Rig
@@ -226,18 +227,8 @@ class Certificate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain JSON values; NaN becomes None."""
-        plain: dict[str, Any] = _plain(asdict(self))
+        plain: dict[str, Any] = to_json(asdict(self))
         return plain
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    return value
 
 
 def working_volume(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.plain import to_plain
 from hybridve.hull.contact.verdict import Facts, judge
 from hybridve.hull.report.collisions import Runs, StoredMesh
 from hybridve.hull.report.columns import (
@@ -178,7 +179,7 @@ def read_report(path: Path) -> Report:
         nothing = np.full(len(reason), "", np.str_)
         return Report(
             path=path,
-            attributes={name: _plain(value) for name, value in file.attrs.items()},
+            attributes={name: to_plain(value) for name, value in file.attrs.items()},
             settings=json.loads(file["hybridve/settings/configuration"].asstr()[()]),
             rig=json.loads(file["hybridve/settings/rig"].asstr()[()]),
             index=frames["index"],
@@ -225,7 +226,7 @@ def _object(
                 group, (PATCH_OFFSET, *PATCH_COLUMNS), origin_m, may_be_absent=False
             ).items()
         }
-    about = {key: _plain(value) for key, value in group.attrs.items()}
+    about = {key: to_plain(value) for key, value in group.attrs.items()}
     found = ObjectColumns(columns, patches, about)
     for name in ("collides", "n_points", "n_triangles", "certificate", "witness_m", "open_at_m"):
         found[name]  # a report without these is damaged
@@ -320,9 +321,3 @@ def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float64], N
 def read_mesh(group: h5py.Group) -> StoredMesh:
     """Return the mesh that stands in an object's group."""
     return StoredMesh(*(group[column.name][:] for column in MESH_COLUMNS))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        return value.item()
-    return value.tolist() if isinstance(value, np.ndarray) else value

@@ -17,7 +17,6 @@ which `kind` it is: exact, a bound given the silhouettes, or an estimate.
 """
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.plain import to_json
 from hybridve.hull.report.machine import Run
 from hybridve.hull.report.result_file import (
     Described,
@@ -436,15 +436,15 @@ def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
     return {
         "name": one.name,
         "settings": one.settings,
-        "shift_m": _number(one.shift_m),
-        "at_least_m": _number(one.at_least_m),
+        "shift_m": to_json(one.shift_m),
+        "at_least_m": to_json(one.at_least_m),
         "at_95": None
         if doubt is None
         else {
             "kind": "estimate",
-            "shift_m": _number(doubt.shift_m),
+            "shift_m": to_json(doubt.shift_m),
             "frame": doubt.frame,
-            "std_m": _number(doubt.std_m),
+            "std_m": to_json(doubt.std_m),
         },
         "binding": None
         if binding is None
@@ -453,9 +453,9 @@ def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
             "time_s": binding.time_s,
             "object": binding.object_name,
             "shift_m": binding.shift_m,
-            "on_hull_m": _numbers(binding.on_hull_world),
-            "on_object_m": _numbers(binding.on_object_world),
-            "clearance_m": _numbers(binding.clearance_m),
+            "on_hull_m": to_json(binding.on_hull_world),
+            "on_object_m": to_json(binding.on_object_world),
+            "clearance_m": to_json(binding.clearance_m),
             "required_clearance_m": binding.required_m,
         },
         "free_m": one.free_m.tolist(),
@@ -483,17 +483,9 @@ def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
                 "violated_m": frames.violated.of(row).tolist(),
                 "undecided_m": frames.undecided.of(row).tolist(),
                 "unsure_95_m": None if doubt is None else doubt.unsure.of(row).tolist(),
-                "std_m": None if doubt is None else _number(float(doubt.std_by_frame_m[row])),
+                "std_m": None if doubt is None else to_json(float(doubt.std_by_frame_m[row])),
                 "measurements": int(frames.n_measured[row]),
             }
             for row in range(len(frames.index))
         ],
     }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _numbers(values: NDArray[np.float64]) -> list[float | None]:
-    return [_number(value) for value in values.tolist()]

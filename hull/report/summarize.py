@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.plain import to_json
 from hybridve.hull.contact.verdict import VERDICTS, worst
 from hybridve.hull.report.read import ObjectColumns, Report
 
@@ -170,7 +171,7 @@ def _about_touching(
                 "last_frame": int(report.index[last]),
                 "start_s": float(report.time_s[first]),
                 "stop_s": float(report.time_s[last]),
-                **{name: _plain(rows[name][first]) for name in _ENTRY if name in rows},
+                **{name: to_json(rows[name][first]) for name in _ENTRY if name in rows},
             }
             for first, last in spans(rows.clashes, ~is_valid | is_doubtful)
         ],
@@ -211,15 +212,15 @@ def _about_clearance(
     row = int(valid[np.lexsort((upper_m[valid], lower_m[valid]))[0]])
     at_least_m = rows.get("clearance_at_least_m")
     found["clearance"] = {
-        "lower_m": _plain(lower_m[row]),
-        "upper_m": _plain(upper_m[row]),
+        "lower_m": to_json(lower_m[row]),
+        "upper_m": to_json(upper_m[row]),
         "at_least_95_m": None
         if at_least_m is None
-        else _plain(np.fmin.reduce(np.where(lower_m > 0, at_least_m, 0.0)[valid])),
+        else to_json(np.fmin.reduce(np.where(lower_m > 0, at_least_m, 0.0)[valid])),
         "frame": int(report.index[row]),
         "time_s": float(report.time_s[row]),
-        "on_object_m": _plain(rows["clearance_on_object_m"][row]),
-        "on_hull_m": _plain(rows["clearance_on_hull_m"][row]),
+        "on_object_m": to_json(rows["clearance_on_object_m"][row]),
+        "on_hull_m": to_json(rows["clearance_on_hull_m"][row]),
     }
     depth_m = np.nan_to_num(rows["depth_m"])
     row = int(depth_m[:, 0].argmax())
@@ -246,13 +247,13 @@ def _about_recovery(rows: ObjectColumns, report: Report) -> dict[str, Any]:
     shift_m = np.nan if frees is None or not asked.any() else rows["free_shift_m"][asked, 1].max()
     return {
         "recovery": {
-            "d_rec_m": _plain(d_rec_m[row]),
+            "d_rec_m": to_json(d_rec_m[row]),
             "frames_no_exit": no_exit,
             "frames_asked_to_free": int(asked.sum()),
             "frames_freed": 0 if frees is None else int((frees == "yes").sum()),
-            "free_shift_m": _plain(shift_m),
-            "d_rec_paper_m": _plain(rows["d_rec_paper_m"][row]),
-            "v_rec": _plain(rows["v_rec"][row]),
+            "free_shift_m": to_json(shift_m),
+            "d_rec_paper_m": to_json(rows["d_rec_paper_m"][row]),
+            "v_rec": to_json(rows["v_rec"][row]),
             "frame": int(report.index[row]),
             "time_s": float(report.time_s[row]),
         }
@@ -269,15 +270,6 @@ def _about_doubt(rows: ObjectColumns) -> dict[str, Any]:
         "hinges_on": sorted(cameras),
         "frames_unsure": int((rows.clashes & (rows["component"] == "unsure")).sum()),
     }
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON has it; None for a number that is not finite."""
-    if isinstance(value, np.ndarray):
-        return [_plain(one) for one in value]
-    if isinstance(value, np.floating):
-        return float(value) if np.isfinite(value) else None
-    return str(value)
 
 
 def spans(

@@ -22,6 +22,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.plain import to_json
 from hybridve.hull.report.result_file import (
     Described,
     read_run,
@@ -288,7 +289,7 @@ def sweep_as_dict(sweep: Sweep) -> dict[str, Any]:
             for stage in ("decode", "segment", "hull", "boxes", "certify", "sample")
         },
         "truth": {
-            **{name: _number(value) for name, value in asdict(sweep.truth).items()},
+            **to_json(asdict(sweep.truth)),
             "triangles_asked": asked,
             "triangles_colliding": colliding,
             "triangles_open": n_open,
@@ -304,7 +305,7 @@ def sweep_as_dict(sweep: Sweep) -> dict[str, Any]:
                     {
                         "label": rows.labels[row],
                         "viewport": int(rows.viewport[row]) or None,
-                        "accuracy_m": _number(rows.accuracy_m[row]),
+                        "accuracy_m": to_json(rows.accuracy_m[row]),
                         "samples": int(rows.samples[row]),
                         "ms_median": 1e3 * float(engine.time_median_s[row]),
                         "ms_iqr": 1e3 * float(engine.time_iqr_s[row]),
@@ -318,12 +319,12 @@ def sweep_as_dict(sweep: Sweep) -> dict[str, Any]:
                         ),
                         "objects_missed": int(engine.objects_missed[row]),
                         "triangles_against_proof": int(engine.triangles_against_proof[row]),
-                        "distance_max_m": _number(engine.distance_max_m[row]),
-                        "distance_p99_m": _number(engine.distance_p99_m[row]),
-                        "distance_median_m": _number(engine.distance_median_m[row]),
+                        "distance_max_m": to_json(engine.distance_max_m[row]),
+                        "distance_p99_m": to_json(engine.distance_p99_m[row]),
+                        "distance_median_m": to_json(engine.distance_median_m[row]),
                         "predicted_m": float(rows.predicted_m[row]),
-                        "predicted_near_m": _number(rows.predicted_near_m[row]),
-                        "within_predicted": _number(engine.within_predicted[row]),
+                        "predicted_near_m": to_json(rows.predicted_near_m[row]),
+                        "within_predicted": to_json(engine.within_predicted[row]),
                         "held": held(engine, row),
                         "on_front": bool(engine.on_front[row]),
                     }
@@ -353,7 +354,3 @@ def held(engine: EngineSweep, row: int) -> bool | None:
     if math.isnan(engine.within_predicted[row]):
         return None
     return bool(engine.within_predicted[row] == 1.0)
-
-
-def _number(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
