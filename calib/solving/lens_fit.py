@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.boards.board import Board, Observations, is_seen
+from hybridve.calib.boards.board import Board, Observations, Sighting, is_seen
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import natural_order
@@ -35,7 +35,6 @@ from hybridve.calib.solving.lens_adjust import (
 )
 from hybridve.calib.solving.lens_judge import (
     Fit,
-    LensView,
     refuse_degenerate,
     sigmas_of,
     view_label,
@@ -200,8 +199,10 @@ def _given_lens(seen: Observations, params: NDArray[np.float64]) -> FittedLens:
 
 def collect_views(
     boards: Sequence[Board], seen: Sequence[Observations], settings: LensSettings, is_free: bool
-) -> tuple[list[LensView], dict[tuple[int, str], str]]:
+) -> tuple[list[tuple[int, Sighting]], dict[tuple[int, str], str]]:
     """Return the views that can be used, in natural order, and why others cannot.
+
+    Of each the number of its camera among those that share the lens is told.
 
     Raises
     ------
@@ -217,7 +218,8 @@ def collect_views(
                     *first.size_px, other.model, *other.size_px
                 )
             )
-    views, unusable = [], {}
+    views: list[tuple[int, Sighting]] = []
+    unusable: dict[tuple[int, str], str] = {}
     for owner, camera in enumerate(seen):
         for sighting in camera.sightings:
             if sighting.instant is not None and camera.is_still:
@@ -231,8 +233,8 @@ def collect_views(
             elif thinness(points) < NEARLY_LINE:
                 unusable[owner, label] = f"its {len(points)} corners lie on a line"
             else:
-                views.append(LensView(owner, sighting.image, sighting.board, sighting.pixels))
-    views.sort(key=lambda view: (seen[view.owner].name, natural_order(view.image), view.board))
+                views.append((owner, sighting))
+    views.sort(key=lambda own: (seen[own[0]].name, natural_order(own[1].image), own[1].board))
     if is_free and len(views) < settings.min_views:
         n_missed = len(unusable) + sum(len(camera.missed) for camera in seen)
         found = f"in {len(views)} of {len(views) + n_missed} pictures"
@@ -247,12 +249,12 @@ def collect_views(
     return views, unusable
 
 
-def make_batch(boards: Sequence[Board], views: Sequence[LensView]) -> Batch:
-    """Return views padded to the longest board."""
-    longest = max((len(boards[view.board].points_board) for view in views), default=0)
+def make_batch(boards: Sequence[Board], views: Sequence[tuple[int, Sighting]]) -> Batch:
+    """Return the views of `collect_views` padded to the longest board."""
+    longest = max((len(boards[view.board].points_board) for _, view in views), default=0)
     points = np.zeros((len(views), longest, 3))
     pixels = np.full((len(views), longest, 2), np.nan)
-    for index, view in enumerate(views):
+    for index, (_, view) in enumerate(views):
         n_points = len(boards[view.board].points_board)
         points[index, :n_points] = boards[view.board].points_board
         seen = is_seen(view.pixels)
@@ -385,7 +387,7 @@ def noise_of(residuals: NDArray[np.float64], n_params: int) -> float:
 def share_out(
     boards: Sequence[Board],
     seen: Sequence[Observations],
-    views: Sequence[LensView],
+    views: Sequence[tuple[int, Sighting]],
     unusable: dict[tuple[int, str], str],
     batch: Batch,
     fit: Fit,
@@ -398,9 +400,9 @@ def share_out(
     for owner, camera in enumerate(seen):
         dropped = {label: why for (whose, label), why in unusable.items() if whose == owner}
         poses, pixels, outliers = {}, {}, []
-        mine = [index for index, view in enumerate(views) if view.owner == owner]
+        mine = [index for index, (whose, _) in enumerate(views) if whose == owner]
         for index in mine:
-            view = views[index]
+            _, view = views[index]
             if not fit.kept[index]:
                 dropped[view_label(boards, view.image, view.board)] = fit.reasons.get(
                     index, "the lens sees no ray at some corner"

@@ -1,7 +1,7 @@
 """Whether views can tell a lens: parallel boards, small ones, tilts that fit as well."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -43,16 +43,6 @@ _CLEAR_SIGMA = 10.0
 
 #: Corners that leave more than this share of the image unvisited leave the lens unknown there.
 _LEAST_COVER = 0.4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LensView:
-    """One board in one image of one of the cameras that share a lens."""
-
-    owner: int
-    image: str
-    board: int
-    pixels: NDArray[np.float64] = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
