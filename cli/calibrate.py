@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridve.calib.judging.account import Calibration
-    from hybridve.calib.judging.certificate import Certificate, SeenPoints, Volume
+    from hybridve.calib.judging.certificate import Certificate, Volume
     from hybridve.calib.record import CalibrationRecord, CameraRecord
     from hybridve.calib.rig import Rig
     from hybridve.calib.verdict import RigCheck
@@ -197,7 +197,7 @@ def _calibrate(
 ) -> None:
     from hybridve.calib.formats.colmap import write_colmap_model
     from hybridve.calib.formats.rig_json import write_rig
-    from hybridve.calib.judging.certificate import SeenPoints, certify, working_volume
+    from hybridve.calib.judging.certificate import certify, working_volume
     from hybridve.calib.plain import to_json
     from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
     from hybridve.hull.report.write import refuse_existing
@@ -213,13 +213,9 @@ def _calibrate(
         calibration = calibrate_session(session, terminal.stage, box_world)
         rig = calibration.rig
         volume = working_volume(rig, box_world)
-        seen = {
-            name: SeenPoints(pixels, calibration.residuals_px[name])
-            for name, pixels in calibration.pixels.items()
-        }
-        certificate = certify(rig, calibration.record, seen, volume)
+        certificate = certify(rig, calibration.record, calibration.seen, volume)
         _write_certificate(
-            folder, session, calibration, certificate, seen, volume, max_error_m, with_page
+            folder, session, calibration, certificate, volume, max_error_m, with_page
         )
     write_colmap_model(folder / "colmap", rig)
     write_rig(path, rig)
@@ -236,7 +232,6 @@ def _write_certificate(
     session: "Session",
     calibration: "Calibration",
     certificate: "Certificate",
-    seen: dict[str, "SeenPoints"],
     volume: "Volume",
     max_error_m: float | None,
     with_page: bool,
@@ -262,7 +257,7 @@ def _write_certificate(
         page,
         calibration.rig,
         certificate,
-        seen,
+        calibration.seen,
         volume,
         title=session.name,
         details=to_plain(calibration.record),

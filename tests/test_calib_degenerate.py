@@ -23,7 +23,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.rig_json import rig_to_dict
 from hybridve.calib.judging.account import Calibration
-from hybridve.calib.judging.certificate import Certificate, SeenPoints, certify, working_volume
+from hybridve.calib.judging.certificate import Certificate, certify, working_volume
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.placing.settings import CalibrationSettings, LensRequest
 from hybridve.calib.pose import (
@@ -57,11 +57,7 @@ def calibrated(
     """Return a calibration and its certificate, both of which are plain JSON."""
     calibration = solve_rig(boards, observations, settings, requests=requests)
     rig = calibration.rig
-    seen = {
-        name: SeenPoints(pixels, calibration.residuals_px[name])
-        for name, pixels in calibration.pixels.items()
-    }
-    certificate = certify(rig, calibration.record, seen, working_volume(rig))
+    certificate = certify(rig, calibration.record, calibration.seen, working_volume(rig))
     json.dumps([certificate.to_dict(), rig_to_dict(rig)], allow_nan=False)
     return calibration, certificate
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Observations, is_seen
-from hybridve.calib.judging.certificate import working_volume
+from hybridve.calib.judging.certificate import SeenPoints, working_volume
 from hybridve.calib.placing.fixed_cameras import Solved, other_tilt
 from hybridve.calib.placing.moments import PoseKey
 from hybridve.calib.placing.moving_cameras import Mounted
@@ -46,14 +46,13 @@ class Calibration:
         With its covariance; its provenance is `record`.
     record : CalibrationRecord
         Errors per camera, what was decided, dropped and doubted, and why.
-    pixels, residuals_px : dict of str to (K, 2) float64
-        By camera all points that were used, and observed minus projected.
+    seen : dict of str to SeenPoints
+        By camera all points that were used, and by how much the rig misses them.
     """
 
     rig: Rig
     record: CalibrationRecord
-    pixels: dict[str, NDArray[np.float64]]
-    residuals_px: dict[str, NDArray[np.float64]]
+    seen: dict[str, SeenPoints]
 
 
 def put_together(
@@ -83,8 +82,7 @@ def put_together(
         How it was done.
     """
     cameras = (() if solved is None else solved.cameras) + tuple(one.camera for one in mounted)
-    pixels: dict[str, NDArray[np.float64]] = {}
-    residuals: dict[str, NDArray[np.float64]] = {}
+    used: dict[str, SeenPoints] = {}
     views: Sequence[tuple[BundleView, NDArray[np.float64]]] = ()
     keys: Sequence[PoseKey] = ()
     if solved is not None:
@@ -99,8 +97,8 @@ def put_together(
         if own:
             every = np.concatenate([missed for _, missed in own])
             found = is_seen(every)
-            residuals[seen.name] = every[found]
-            pixels[seen.name] = np.concatenate([view.pixels for view, _ in own])[found]
+            pixels = np.concatenate([view.pixels for view, _ in own])
+            used[seen.name] = SeenPoints(pixels[found], every[found])
         told[seen.name] = _told_of_camera(boards, seen, lens, alone, clip, mounts.get(seen.name))
     noise = (
         solved.noise
@@ -134,7 +132,7 @@ def put_together(
         adjustment=None if solved is None else _told_of_adjustment(solved),
         second_opinion=opinion,
     )
-    return Calibration(replace(rig, provenance=record), record, pixels, residuals)
+    return Calibration(replace(rig, provenance=record), record, used)
 
 
 def _told_of_adjustment(solved: Solved) -> Adjustment:
