@@ -33,7 +33,6 @@ from hybridve.calib.seeing.search import (
     Search,
     length_of,
     listed_boards,
-    name_of,
     search_pictures,
 )
 from hybridve.calib.seeing.stills import notes_of, sightings_of, without_parts
@@ -275,7 +274,7 @@ def _observe_still_clip(search: Search, clip: _Clip, given: Given) -> Observatio
         tuple(Sighting(CLIP, 0, number, pixels) for number, pixels in corners.items()),
         True,
         picture=clip.picture,
-        how="; ".join(f"{name_of(boards, number)}: {how}" for number, how in hows.items())
+        how="; ".join(f"{boards[number].name}: {how}" for number, how in hows.items())
         if len(boards) > 1
         else hows[0],
         spread_px=max(known_px) if known_px else None,

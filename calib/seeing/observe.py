@@ -20,7 +20,7 @@ from hybridve.calib.seeing.clip import observe_clips
 from hybridve.calib.seeing.corner_cache import CornerCache
 from hybridve.calib.seeing.given import given_corners
 from hybridve.calib.seeing.inputs import AUTO_MODEL, CameraInput, ObserveSettings, Progress
-from hybridve.calib.seeing.search import Search, describe_board, name_of
+from hybridve.calib.seeing.search import Search, describe_board
 from hybridve.calib.seeing.stills import observe_stills
 
 logger = logging.getLogger(__name__)
@@ -116,13 +116,13 @@ def _no_progress(what: str, done: int, total: int) -> None:
 def _check_boards(boards: Sequence[Board]) -> None:
     if not boards:
         raise CalibrationError("there is no board to look for; describe at least one")
-    for (i, first), (j, second) in combinations(enumerate(boards), 2):
+    for first, second in combinations(boards, 2):
         alike = describe_board(first) == describe_board(second)
         if isinstance(first, Chessboard) and isinstance(second, Chessboard):
             alike = {first.columns, first.rows} == {second.columns, second.rows}
         if alike:
             raise CalibrationError(
-                f"boards {name_of(boards, i)!r} and {name_of(boards, j)!r} look alike "
+                f"boards {first.name!r} and {second.name!r} look alike "
                 f"({first}), so that no picture tells one from the other; use boards of different "
                 "numbers of corners, or with different markers"
             )

@@ -118,11 +118,6 @@ def _digest_of_code(files: frozenset[Path]) -> str:
     return digest.hexdigest()
 
 
-def name_of(boards: Sequence[Board], index: int) -> str:
-    """Return what a board is called."""
-    return getattr(boards[index], "name", f"board{index + 1}")
-
-
 def listed_boards(boards: Sequence[Board]) -> str:
     """Return that none of the boards is there, to be followed by where."""
     if len(boards) == 1:

@@ -14,7 +14,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import FrameSource
 from hybridve.calib.seeing.given import Given, serves_as_stills, take_given
 from hybridve.calib.seeing.inputs import CameraInput
-from hybridve.calib.seeing.search import Choice, Found, Search, length_of, name_of, search_pictures
+from hybridve.calib.seeing.search import Choice, Found, Search, length_of, search_pictures
 
 logger = logging.getLogger(__name__)
 
@@ -122,5 +122,5 @@ def without_parts(boards: Sequence[Board], found: dict[int, Detection]) -> dict[
 
 def notes_of(boards: Sequence[Board], number: int, image: str, detection: Detection) -> list[str]:
     """Return what is to be told of a detection: in which image, of which board."""
-    which = f", {name_of(boards, number)}" if len(boards) > 1 else ""
+    which = f", {boards[number].name}" if len(boards) > 1 else ""
     return [f"{image}{which}: {note}" for note in detection.notes]
