@@ -1,9 +1,7 @@
 """What is recognisable around a board: it tells which way round each camera saw a symmetric one.
 
 This work is based on: Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., 2003 (sections
-9.6 and 11.4.3, epipolar constraint and its first-order distance); Lowe, *Distinctive image features
-from scale-invariant keypoints*, IJCV 60(2), 2004; Arandjelovic and Zisserman, *Three things
-everyone should know to improve object retrieval*, CVPR 2012 (RootSIFT).
+9.6 and 11.4.3, epipolar constraint and its first-order distance).
 """
 
 from collections.abc import Sequence
@@ -20,10 +18,10 @@ from hybridve.calib.boards.target import grey_of
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens import cam_from_img, img_from_cam
 from hybridve.calib.pose import Pose, compose, invert, transform
+from hybridve.calib.seeing.features import find_features, mutual_matches
 
 #: Features kept of one picture, the strongest first; matching is quadratic in them.
 MAX_FEATURES = 3000
-_MIN_CONTRAST = 0.02
 
 #: A match agrees with two poses when it misses its epipolar line by less than this (pixels), and
 #: when on the floor its two places are nearer than this (squares of the board).
@@ -96,7 +94,7 @@ def describe_scene(
     grey = np.clip(np.round(grey_of(image)), 0, 255).astype(np.uint8)
     focal_px = float(camera.pinhole[0, 0])
     upright = np.ascontiguousarray(grey[:, ::-1]) if is_mirrored else grey
-    pixels, descriptors = _features(upright, max_features)
+    pixels, descriptors = find_features(upright, max_features)
     if is_mirrored:
         # A flipped lens is no lens of its model: the lens is asked where the picture was taken.
         pixels = pixels * [-1.0, 1.0] + [grey.shape[1], 0.0]
@@ -135,19 +133,6 @@ def with_floor(
         camera, cam_from_board, grey, board, max_features
     )
     return replace(scene, floor_points=floor_points, floor_descriptors=floor_descriptors)
-
-
-def _features(
-    grey: NDArray[np.uint8], max_features: int, mask: NDArray[np.uint8] | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return places (K, 2), pixel centre at 0.5, and RootSIFT descriptors (K, 128)."""
-    sift: Any = cv2.SIFT.create(max_features, contrastThreshold=_MIN_CONTRAST)
-    points, descriptors = sift.detectAndCompute(grey, mask)
-    if not points:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    total = np.maximum(np.abs(descriptors).sum(axis=1, keepdims=True), 1e-9)
-    places = np.array([point.pt for point in points], np.float64) + 0.5
-    return places, np.sqrt(descriptors / total).astype(np.float32)
 
 
 def _on_board(points: NDArray[np.float64], board: Board) -> NDArray[np.bool_]:
@@ -192,7 +177,7 @@ def _floor_features(
     on_board = _on_board(points, board)
     usable = (seen & ~on_board).reshape(shape).astype(np.uint8) * np.uint8(255)
     mask = np.asarray(cv2.erode(usable, np.ones((9, 9), np.uint8), borderValue=0), np.uint8)
-    places, descriptors = _features(view, max_features, mask)
+    places, descriptors = find_features(view, max_features, mask)
     return (places / _FLOOR_PIXELS * 2.0 - 1.0) * reach_m + board.center_board[:2], descriptors
 
 
@@ -226,8 +211,8 @@ def count_agreeing(
     if turns is None:
         turns = [board.board_from_turned(look) for look in range(len(board.looks))]
     counts = np.zeros(len(turns), dtype=np.intp)
-    near, far = _mutual_matches(first.descriptors, second.descriptors)
-    on_floor, on_other_floor = _mutual_matches(first.floor_descriptors, second.floor_descriptors)
+    near, far = mutual_matches(first.descriptors, second.descriptors)
+    on_floor, on_other_floor = mutual_matches(first.floor_descriptors, second.floor_descriptors)
     for look, turned in enumerate(turns):
         pose = compose(second_from_board, turned)
         counts[look] += int(
@@ -246,18 +231,6 @@ def count_agreeing(
         misses = np.linalg.norm(points - second.floor_points[on_other_floor], axis=1)
         counts[look] += int((misses < _FLOOR_SQUARES * board.square_m).sum())
     return counts
-
-
-def _mutual_matches(
-    first: NDArray[np.float32], second: NDArray[np.float32]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of descriptors that are each other's nearest."""
-    if not len(first) or not len(second):
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    likeness = first @ second.T
-    forward, backward = likeness.argmax(axis=1), likeness.argmax(axis=0)
-    mutual = np.flatnonzero(backward[forward] == np.arange(len(first)))
-    return mutual, forward[mutual]
 
 
 def _agree(
