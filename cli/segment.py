@@ -57,6 +57,7 @@ def segment(
         silhouette_stamp,
     )
     from hybridve.hull.capture.rig import has_rig, load_rig, rig_digest
+    from hybridve.hull.capture.room_check import check_room
     from hybridve.hull.capture.session import load_session
     from hybridve.hull.capture.silhouette_io import SilhouetteWriter
     from hybridve.hull.report.write import refuse_existing
@@ -71,6 +72,7 @@ def segment(
     digest, clean = None, None
     if not unconfirmed and has_rig(loaded):
         rig = load_rig(loaded, terminal.stage)
+        check_room(loaded, rig, terminal.stage)  # said before the work, and once
         digest, clean = rig_digest(rig), _cleaner(loaded, rig)
 
     names = [camera.name for camera in loaded.cameras]

@@ -31,6 +31,7 @@ from hybridve.hull.capture.recording import (
     stored_silhouettes,
 )
 from hybridve.hull.capture.rig import load_rig, rig_digest
+from hybridve.hull.capture.room_check import RoomCheck, check_room
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 from hybridve.hull.capture.tracks import Tracks, read_tracks
@@ -108,6 +109,9 @@ class Chain:
         Where stored silhouettes stand that are those of this session; None to segment now.
     tracks : Tracks
         Where moving cameras were.
+    room : RoomCheck
+        Whether the cameras still stand where they were calibrated, as far as the session's
+        pictures show it.
     """
 
     session: Session
@@ -119,6 +123,7 @@ class Chain:
     bodies: list[Body]
     silhouettes: Path | None
     tracks: Tracks = field(default_factory=Tracks)
+    room: RoomCheck = field(default_factory=RoomCheck)
 
 
 def rig_views(session: Session, rig: Rig) -> tuple[Views, list[Undistortion]]:
@@ -189,7 +194,8 @@ def make_chain(
 ) -> Chain:
     """Return everything that is the same for all frames.
 
-    `progress` is told ``(what, done, total)`` while a rig that was not tested yet is tested.
+    `progress` is told ``(what, done, total)`` while a rig that was not tested yet is tested. A
+    camera that has moved since it was calibrated is logged as a warning, and stands in ``room``.
 
     Raises
     ------
@@ -197,6 +203,7 @@ def make_chain(
         If recordings, rig and scene do not fit together.
     """
     rig = load_rig(session, progress)
+    room = check_room(session, rig, progress)
     tracks = read_tracks(session, rig)
     silhouettes = stored_silhouettes(session, rig_digest(rig))
     if silhouettes is None:
@@ -216,7 +223,9 @@ def make_chain(
                 f"{scene.path}: object {scene_object.name!r}: {error}; ask for less accuracy, or "
                 "refine the mesh"
             ) from error
-    return Chain(session, rig, scene, settings, undistortions, views, bodies, silhouettes, tracks)
+    return Chain(
+        session, rig, scene, settings, undistortions, views, bodies, silhouettes, tracks, room
+    )
 
 
 def first_rig(rig: Rig, tracks: Tracks) -> Rig:

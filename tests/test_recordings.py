@@ -8,12 +8,17 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from helpers.rooms import see_wall, true_shift_px
 from numpy.typing import NDArray
 
+from hybridve.calib.camera import Camera
 from hybridve.calib.formats.rig_json import read_rig
+from hybridve.calib.lens import img_from_cam
 from hybridve.calib.record import CalibrationRecord
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import load_rig
+from hybridve.hull.capture.room_check import check_room
+from hybridve.hull.capture.room_shift import room_shift
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 from hybridve.hull.chain import rig_views
@@ -107,6 +112,47 @@ def test_horseman_is_calibrated_as_others_did_and_stands_above_the_floor(horsema
     for camera in rig.provenance.cameras.values():
         assert camera.intrinsics.rms_px is not None
         assert camera.intrinsics.rms_px <= 0.5
+
+
+def test_no_camera_of_horseman_moved_between_board_and_empty_room(horseman: Path) -> None:
+    check = check_room(load_session(horseman), read_rig(horseman / "rig" / "rig.json"))
+
+    assert list(check.cameras) == ["cam1", "cam2", "cam3", "cam4"]
+    for found in check.cameras.values():
+        assert found.state == "same"
+        assert found.largest_px is not None
+        assert found.largest_px < 0.1
+        assert found.n_features > 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turn_deg", [0.2, 1.0, 5.0])
+def test_a_camera_of_horseman_that_is_turned_is_found_to_be(
+    horseman: Path, turn_deg: float
+) -> None:
+    lens = read_rig(horseman / "rig" / "rig.json")["cam2"]
+    camera = next(one for one in load_session(horseman).cameras if one.name == "cam2")
+    assert camera.extrinsics is not None
+    assert camera.background is not None
+    then, empty = (
+        cv2.cvtColor(source.first(), cv2.COLOR_BGR2GRAY)
+        for source in (camera.extrinsics, camera.background)
+    )
+    turn = np.radians(turn_deg) * np.array([0.6, -0.7, 0.39])
+    now = see_wall(lens, empty.astype(np.float32), turn, place_of=lambda rays: _seen(lens, rays))
+
+    found = room_shift(lens, then, np.clip(np.round(now), 0, 255).astype(np.uint8))
+
+    assert found.state == "moved"
+    assert found.shift_px is not None
+    assert found.se_px is not None
+    errors_px = np.array(found.shift_px) - true_shift_px(lens, turn)
+    assert (np.abs(errors_px) < 4.0 * np.array(found.se_px)).all()
+    assert max(found.se_px) < 0.1
+
+
+def _seen(lens: Camera, rays: np.ndarray) -> np.ndarray:
+    return img_from_cam(lens, np.column_stack([rays, np.ones(len(rays))])) - 0.5
 
 
 @pytest.mark.slow

@@ -120,8 +120,8 @@ class Session:
     rig_file : RigFile or None
         A calibration made elsewhere.
     rig_check : str
-        Whether a rig that is used is tested against the boards that the cameras saw: "on", or
-        "off" where it is to be used whatever they say.
+        Whether a rig that is used is tested against the boards that the cameras saw, and the
+        cameras for having moved since: "on", or "off" where it is to be used whatever they say.
     mask_threshold : int
         Pixels of ready masks above it are object pixels.
     segmentation : SegmentSettings
