@@ -45,6 +45,7 @@ COMPARISON = "COMPARISON.csv"
 )
 @options.engine_option
 @options.frames_option
+@options.drop_camera_option
 @options.response_options
 @click.option(
     "--points",
@@ -67,6 +68,7 @@ COMPARISON = "COMPARISON.csv"
     multiple=True,
     help="A verdict besides 'kept' that --fail-on-clash lets pass; may be given several times.",
 )
+@options.fail_on_doubt_option
 @options.json_option
 @options.quiet_progress
 def detect(
@@ -82,6 +84,8 @@ def detect(
     overwrite: bool,
     fail_on_clash: bool,
     let_pass: tuple[str, ...],
+    fail_on_doubt: bool,
+    drop_cameras: tuple[str, ...],
     points: Literal["sample", "all"],
     as_json: bool,
     progress: bool,
@@ -96,6 +100,9 @@ def detect(
     With several SESSIONs, or several --scene, every session is tested against every layout: -o is
     a folder that takes a report each, SESSION__SCENE.h5, and a table of them all, COMPARISON.csv.
     Run `hybridve segment` first where there are many layouts: each takes the silhouettes as stored.
+
+    What the cameras say about each other comes first: a session whose silhouettes, rig and clock do
+    not belong together is not to be trusted, and nothing in it is certified.
 
     \b
     Example:
@@ -120,6 +127,7 @@ def detect(
             viewport=None if accuracy_mm is not None else viewport or 10,
             accuracy_m=None if accuracy_mm is None else accuracy_mm / 1000.0,
             open_at_m=open_at_mm / 1000.0 or None,
+            drop_cameras=drop_cameras,
             **response,
         ),
         engine=engine,
@@ -143,6 +151,8 @@ def detect(
             click.echo(json.dumps(found[0]))
         else:
             print_summary(report)
+    if fail_on_doubt and not all(numbers["trusted"] for numbers in found):
+        sys.exit(5)
     if fail_on_clash and any(failing(numbers, let_pass) for numbers in found):
         sys.exit(3)
 

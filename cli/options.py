@@ -92,6 +92,21 @@ scenes_option = click.option(
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what stands under the output's name."
 )
+drop_camera_option = click.option(
+    "--drop-camera",
+    "drop_cameras",
+    metavar="NAME",
+    multiple=True,
+    help="Evaluate as if the session had not this camera; may be given several times.",
+)
+
+fail_on_doubt_option = click.option(
+    "--fail-on-doubt",
+    is_flag=True,
+    help="Leave with status 5 where the cameras contradict each other, so that the session is not "
+    "to be trusted.",
+)
+
 frames_option = click.option(
     "--frames",
     type=Frames(),

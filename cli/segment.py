@@ -3,19 +3,11 @@
 import json
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from hybridve.cli import options
 from hybridve.cli.progress import Terminal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from hybridve.calib.rig import Rig
-    from hybridve.hull.capture.recording import Mask
-    from hybridve.hull.capture.session import Session
 
 
 @click.command(short_help="Cut the real things out of the recording.")
@@ -48,6 +40,8 @@ def segment(
     """
     import cv2
 
+    from hybridve.calib.plain import to_json
+    from hybridve.hull.agreement.record import SessionAgreement
     from hybridve.hull.capture.recording import (
         FrameRange,
         check_lengths,
@@ -61,6 +55,7 @@ def segment(
     from hybridve.hull.capture.session import load_session
     from hybridve.hull.capture.silhouette_io import SilhouetteWriter
     from hybridve.hull.report.write import refuse_existing
+    from hybridve.hull.trust import Desk
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
     terminal = Terminal(enabled=progress)
@@ -69,11 +64,11 @@ def segment(
     refuse_existing(output, overwrite=overwrite)
     sizes_px = check_recording(loaded)
     check_lengths(loaded, FrameRange())
-    digest, clean = None, None
+    digest, desk = None, None
     if not unconfirmed and has_rig(loaded):
         rig = load_rig(loaded, terminal.stage)
-        check_room(loaded, rig, terminal.stage)  # said before the work, and once
-        digest, clean = rig_digest(rig), _cleaner(loaded, rig)
+        room = check_room(loaded, rig, terminal.stage)  # said before the work, and once
+        digest, desk = rig_digest(rig), Desk.of(loaded, rig, room)
 
     names = [camera.name for camera in loaded.cameras]
     object_pixels = [0] * len(names)
@@ -86,8 +81,8 @@ def segment(
     ):
         for frame in frames:
             masks = frame.masks
-            if masks is not None and clean is not None:
-                masks = clean(frame.index, masks)
+            if desk is not None:
+                masks = desk.take(frame.index, masks)
             writer.append(masks, frame.reason)
             n_frames += 1
             if masks is None:
@@ -96,6 +91,7 @@ def segment(
                 for camera, mask in enumerate(masks):
                     object_pixels[camera] += int(mask.sum())
             advance()
+    agreement = SessionAgreement() if desk is None else desk.judge()
     shares = {
         name: pixels / (size[0] * size[1] * max(n_frames - n_invalid, 1))
         for name, pixels, size in zip(names, object_pixels, sizes_px, strict=True)
@@ -107,7 +103,9 @@ def segment(
                     "silhouettes": str(output),
                     "frames": n_frames,
                     "frames_invalid": n_invalid,
-                    "unconfirmed_dropped": clean is not None,
+                    "unconfirmed_dropped": desk is not None,
+                    "trusted": agreement.is_trusted,
+                    "causes": to_json(agreement.causes),
                     "mean_object_share": shares,
                     "bytes": output.stat().st_size,
                 }
@@ -120,21 +118,6 @@ def segment(
     )
     for name, share in shares.items():
         click.echo(f"  {name}: {share:.1%} of the picture is object, on average")
-
-
-def _cleaner(session: "Session", rig: "Rig") -> "Callable[[int, list[Mask]], list[Mask]]":
-    """Return what drops the pieces of a frame's silhouettes that no other camera confirms."""
-    from hybridve.hull.agreement.pieces import drop_unconfirmed
-    from hybridve.hull.capture.tracks import read_tracks
-    from hybridve.hull.chain import first_rig, moved_views, rig_views
-
-    tracks = read_tracks(session, rig)
-    first, lenses = rig_views(session, first_rig(rig, tracks))
-
-    def clean(index: int, masks: "list[Mask]") -> "list[Mask]":
-        if tracks.missing(index):  # where nobody knows what a camera sees, nothing is dropped
-            return masks
-        views = moved_views(session, rig, tracks, index, first, lenses)
-        return drop_unconfirmed(views, lenses, masks)
-
-    return clean
+    trust = "" if agreement.is_trusted else "not to be trusted: "
+    for cause in agreement.causes:
+        click.echo(f"  {trust if cause.is_gross else ''}{cause.message}")

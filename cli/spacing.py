@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +102,8 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     type=click.FloatRange(0, min_open=True),
     help="Steps of that curve. Default: a two hundredth of the range.",
 )
+@options.drop_camera_option
+@options.fail_on_doubt_option
 @options.json_option
 @options.overwrite_option
 @options.quiet_progress
@@ -119,6 +122,8 @@ def spacing(
     output: Path | None,
     picture: Path | None,
     step_mm: float | None,
+    drop_cameras: tuple[str, ...],
+    fail_on_doubt: bool,
     as_json: bool,
     overwrite: bool,
     progress: bool,
@@ -163,7 +168,9 @@ def spacing(
         grow_px=grow_px,
         step_m=None if step_mm is None else step_mm / 1e3,
         evaluation=EvaluateSettings(
-            frames=frames, doubt=options.doubt_of(doubt=doubt, mask_std_px=mask_std_px)
+            frames=frames,
+            doubt=options.doubt_of(doubt=doubt, mask_std_px=mask_std_px),
+            drop_cameras=drop_cameras,
         ),
     )
     try:
@@ -183,6 +190,8 @@ def spacing(
         click.echo(json.dumps({**files, **spacing_as_dict(result)}))
     else:
         _print_result(result)
+    if fail_on_doubt and not all(one.agreement.is_trusted for one in result.sessions):
+        sys.exit(5)
 
 
 def _move_of(
@@ -224,6 +233,10 @@ def _print_result(found: "Spacing") -> None:
         f"to {1e3 * settings['stop_m']:g} mm, to keep {', '.join(required)} mm"
         + (f", silhouettes grown by {settings['grow_px']} px" if settings["grow_px"] else "")
     )
+    for one in found.sessions:
+        trust = "" if one.agreement.is_trusted else "not to be trusted: "
+        for cause in one.agreement.causes:
+            click.echo(f"{one.name}: {trust if cause.is_gross else ''}{cause.message}")
     columns = [_column(one) for one in found.sessions]
     labels = [label for label in columns[0] if any(column[label] for column in columns)]
     rows = [("mm", *(one.name for one in found.sessions))]

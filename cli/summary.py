@@ -72,6 +72,7 @@ def print_summary(report: "Report") -> None:
     numbers = summarize(report)
     click.echo(_overall_text(numbers))
     click.echo(f"{numbers['report']}: {numbers['frames']} frames, {numbers['seconds']:.2f} s")
+    _print_causes(numbers["causes"])
     if numbers["frames_invalid"]:
         invalid = options.counted(numbers["frames_invalid"], "frame")
         click.echo(f"  {invalid} could not be evaluated:")
@@ -128,8 +129,24 @@ def print_summary(report: "Report") -> None:
     click.echo(f"  ms of work a frame, mean: {stages}; engine {numbers['engine']}")
 
 
+def _print_causes(causes: list[dict[str, Any]]) -> None:
+    """Print what is wrong with the cameras; of single frames that are, not more than some."""
+    alone = [cause for cause in causes if cause["kind"] == "frames"]
+    for cause in causes:
+        if cause["kind"] != "frames" or cause in alone[:_MOST_ENTRIES]:
+            click.echo(f"  {cause['message']}")
+    if len(alone) > _MOST_ENTRIES:
+        click.echo(f"  ... and {len(alone) - _MOST_ENTRIES} more such runs of frames (--json)")
+
+
 def _overall_text(numbers: dict[str, Any]) -> str:
     """Return the verdict on all objects in one line."""
+    if not numbers["trusted"]:
+        return f"not to be trusted: the cameras contradict each other ({_verdict_text(numbers)})"
+    return _verdict_text(numbers)
+
+
+def _verdict_text(numbers: dict[str, Any]) -> str:
     every = len(numbers["objects"])
     kept = numbers["objects_by_verdict"].get("kept", 0)
     if kept == every:

@@ -24,6 +24,7 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "session_sha256": session.checksum,
         "scene": str(chain.scene.path),
         "scene_sha256": chain.scene.checksum,
+        "cameras": [camera.name for camera in session.cameras],
         "frames": str(chain.settings.frames),
         "viewport": chain.settings.viewport,
         "accuracy_m": chain.settings.accuracy_m,

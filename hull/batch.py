@@ -28,6 +28,7 @@ from hybridve.hull.report.read import read_report
 from hybridve.hull.report.schema import ReportHeader
 from hybridve.hull.report.summarize import summarize
 from hybridve.hull.report.write import ReportWriter, refuse_existing
+from hybridve.hull.trust import judge_cameras
 from hybridve.hull.watcher import Watcher
 
 _Loaded = TypeVar("_Loaded")
@@ -104,7 +105,15 @@ def write_report(chain: Chain, output: Path, settings: DetectSettings, watcher: 
                     writer.append(result)
                     advance()
             watcher.say(f"writing {output}")
-            writer.finish()
+            writer.finish(
+                judge_cameras(
+                    chain.session,
+                    chain.views,
+                    writer.outlines(),
+                    chain.room,
+                    is_still=not chain.tracks,
+                )
+            )
 
 
 def detect_every(

@@ -77,6 +77,8 @@ class EvaluateSettings:
         Whether that search begins at the point of first contact in the frame of first contact.
     doubt : DoubtSettings or None
         What is assumed of outlines; None, or no clearance, leaves everything undoubted.
+    drop_cameras : tuple of str
+        Cameras that are left out, as if the session had none of them.
     """
 
     frames: FrameRange = field(default_factory=FrameRange)
@@ -87,6 +89,7 @@ class EvaluateSettings:
     response: ResponseSettings | None = None
     backtrack: bool = False
     doubt: "DoubtSettings | None" = None
+    drop_cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,6 +205,7 @@ def make_chain(
     HybridveError
         If recordings, rig and scene do not fit together.
     """
+    session = session.without(settings.drop_cameras)
     rig = load_rig(session, progress)
     room = check_room(session, rig, progress)
     tracks = read_tracks(session, rig)

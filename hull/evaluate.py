@@ -14,17 +14,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
-from hybridve.hull.agreement.frame import (
-    DEFAULT_ERROR_PX,
-    Agreement,
-    disputes,
-    judge_frame,
-    stated_error_px,
-)
-from hybridve.hull.agreement.search import Pencils, make_pencils
+from hybridve.hull.agreement.frame import Agreement, Coherence, judge_frame
 from hybridve.hull.agreement.sight import sight_of
 from hybridve.hull.contact.backtrack import approach_speed, first_contact
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
@@ -51,6 +43,7 @@ if TYPE_CHECKING:
 
 from hybridve.hull.about import computed_parts
 from hybridve.hull.chain import Chain, FrameHull, hulls, make_doubter
+from hybridve.hull.trust import Witness
 
 
 def evaluate(
@@ -107,10 +100,10 @@ def evaluate(
                     findings=findings,
                     stage_s=watch.stage_s,
                     state=state,
-                    rests_on=seen.agreement.reason if seen and state == "evaluated" else "",
+                    rests_on=seen.rests_on if seen and state == "evaluated" else "",
                     cameras=() if seen is None else seen.cameras,
                 )
-            is_known = seen is not None and seen.agreement.is_believed
+            is_known = seen is not None and seen.is_believed
             before = seen if is_known else None
             row += 1
     if row == 0:
@@ -142,8 +135,7 @@ class _Tools:
     certifier: Certifier | None
     meters: list[ClearanceMeter]
     doubter: "Doubter | None"
-    error_px: NDArray[np.int64]
-    pencils: Pencils | None
+    witness: Witness
     share_seen: list[float]
 
     @classmethod
@@ -163,14 +155,16 @@ class _Tools:
                 for part in chain.scene.objects
             ]
         doubter = make_doubter(chain) if "doubt" in computed_parts(settings) else None
-        error_px = np.full(len(chain.views), DEFAULT_ERROR_PX)
-        if doubter is not None:
-            error_px = stated_error_px(doubter.errors.sigma_px)
         is_still = not chain.tracks
-        pencils = make_pencils(chain.views) if is_still else None
+        witness = Witness.of(
+            chain.views,
+            chain.undistortions,
+            None if doubter is None else doubter.errors.sigma_px,
+            is_still=is_still,
+        )
         shares = _shares_seen(chain, chain.views) if is_still else []
         with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:
-            yield cls(engine, certifier, meters, doubter, error_px, pencils, shares)
+            yield cls(engine, certifier, meters, doubter, witness, shares)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,9 +175,20 @@ class _Seen:
     time_s: float
     hull: Hull
     agreement: Agreement
+    coherence: Coherence
     cameras: tuple[CameraFrame, ...]
     contacts: list[Contact]
     clearances: list[Clearance]
+
+    @property
+    def is_believed(self) -> bool:
+        """Whether the hull may be taken for what was there."""
+        return self.agreement.is_believed and not self.coherence.deniers
+
+    @property
+    def rests_on(self) -> str:
+        """Why it may not, or what its emptiness rests on, in words; else empty."""
+        return "; ".join(filter(None, [self.agreement.reason, self.coherence.reason]))
 
 
 def _shares_seen(chain: Chain, views: Views) -> list[float]:
@@ -198,16 +203,25 @@ def _shares_seen(chain: Chain, views: Views) -> list[float]:
 
 def _look(chain: Chain, tools: _Tools, frame: FrameHull, hull: Hull, watch: _Stopwatch) -> _Seen:
     """Return what one frame says by itself, without those before."""
-    pencils = make_pencils(hull.views) if tools.pencils is None else tools.pencils
-    agreement = judge_frame(hull, tools.error_px, pencils)
-    denied_px = {one.camera: one.area_px for one in disputes(hull, tools.error_px, pencils)}
+    agreement = judge_frame(hull, tools.witness.error_px, tools.witness.pencils)
+    found, kept = tools.witness.look(frame.index, hull)
+    denied_px = {one.camera: one.area_px for one in found.disputes}
     cameras = tuple(
-        CameraFrame(share, denied_px.get(name, 0))
-        for name, share in zip(hull.views.names, hull.object_shares().tolist(), strict=True)
+        CameraFrame(
+            share,
+            denied_px.get(name, 0),
+            float(found.supported_share[camera]),
+            float(found.denies_share[camera]),
+            bool(kept.deniers[camera]),
+            kept.outlines[camera],
+        )
+        for camera, (name, share) in enumerate(
+            zip(hull.views.names, hull.object_shares().tolist(), strict=True)
+        )
     )
     watch.lap("agree")
     if agreement.is_contradictory:
-        return _Seen(frame.index, frame.time_s, hull, agreement, cameras, [], [])
+        return _Seen(frame.index, frame.time_s, hull, agreement, found, cameras, [], [])
     contacts = detect_contacts(hull, chain.bodies, tools.engine)
     watch.lap("query")
     if tools.certifier is not None:
@@ -225,7 +239,7 @@ def _look(chain: Chain, tools: _Tools, frame: FrameHull, hull: Hull, watch: _Sto
             for (_, clearance), part in zip(pairs, chain.scene.objects, strict=True)
         ]
     watch.lap("clearance")
-    return _Seen(frame.index, frame.time_s, hull, agreement, cameras, contacts, clearances)
+    return _Seen(frame.index, frame.time_s, hull, agreement, found, cameras, contacts, clearances)
 
 
 def _findings(
@@ -308,8 +322,8 @@ def _completed(
         is_closed=part.is_closed,
         required_m=required_m,
         share_seen=share_seen,
-        rests_on=seen.agreement.reason,
-        is_sound=seen.agreement.is_believed,
+        rests_on=seen.rests_on,
+        is_sound=seen.is_believed,
     )
     if finding.clearance is None:
         return finding

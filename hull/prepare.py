@@ -6,13 +6,17 @@ tried: 8 s instead of 11, for a third more work, as query and certificate share 
 """
 
 import gc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.agreement.frame import disputes, judge_frame
+from hybridve.hull.agreement.causes import diagnose
+from hybridve.hull.agreement.frame import coherence, judge_frame
+from hybridve.hull.agreement.outlines import outline_of, table_of
 from hybridve.hull.agreement.sight import sight_of
+from hybridve.hull.agreement.trials import Trial
 from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings
@@ -85,7 +89,9 @@ def _run_kernels() -> None:
     connected_volumes(hull)
     trio = make_hull(_views(3), [_mask()] * 3)
     judge_frame(trio)
-    disputes(trio, 0)
+    coherence(trio, 0)
+    views = replace(trio.views, img_from_local=_apart(trio.views.img_from_local))
+    diagnose(Trial.of(views, table_of([[outline_of(_mask())] * 3] * 12)))
     sight_of(trio.views, mesh.vertices_world, mesh.faces)
 
 
@@ -93,6 +99,13 @@ def _views(count: int = 1) -> Views:
     matrix = np.array([[50.0, 0, 32, 32], [0, 50, 32, 32], [0, 0, 1, 1]])
     sizes = np.full((count, 2), _SIDE_PX, np.int64)
     return make_views(("camera",) * count, sizes, np.array([matrix] * count), "carve", 1)
+
+
+def _apart(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the projections of cameras that stand beside each other."""
+    beside = matrices.copy()
+    beside[:, 0, 3] += 10.0 * np.arange(len(matrices))
+    return beside
 
 
 def _mask() -> NDArray[np.uint8]:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.hull.about import resolved_settings
+from hybridve.hull.agreement.frame import judge_frame
+from hybridve.hull.agreement.record import SessionAgreement
 from hybridve.hull.cad.scene import Scene, SceneObject, load_scene
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import (
@@ -51,6 +53,7 @@ from hybridve.hull.report.spacing_file import (
     SpacingFrames,
     make_stretches,
 )
+from hybridve.hull.trust import Witness, judge_cameras, unread
 from hybridve.hull.watcher import Watcher
 
 #: Points of a curve at most; what a frame blocks is known for all shifts anyway.
@@ -288,11 +291,22 @@ def replay(
     """
     doubter = make_doubter(chain)
     tally = _Tally(layout, is_doubted=doubter is not None)
+    sigma_px = None if doubter is None else doubter.errors.sigma_px
+    is_still = not chain.tracks
+    witness = Witness.of(chain.views, chain.undistortions, sigma_px, is_still=is_still)
+    seen = []
     with closing(hulls(chain, progress=progress)) as frames:
         for frame in frames:
             if frame.hull is None:
+                seen.append(unread(frame.index, len(chain.views)))
                 tally.leave_out(frame.index, frame.time_s, frame.reason)
             else:
+                seen.append(witness.look(frame.index, frame.hull)[1])
+                agreement = judge_frame(frame.hull, witness.error_px, witness.pencils)
+                if agreement.is_contradictory:  # its hull is empty, its room is not
+                    tally.leave_out(frame.index, frame.time_s, agreement.reason)
+                    advance()
+                    continue
                 hull = grown(frame.hull, grow_px) if grow_px else frame.hull
                 doubts = None
                 if doubter is not None:
@@ -305,9 +319,22 @@ def replay(
             "choose others with --frames"
         )
     settings = resolved_settings(chain)
-    kept = ("session", "session_sha256", "frames", "unseen", "min_cameras", "silhouettes", "doubt")
-    about = {key: settings[key] for key in kept}
-    return tally.answer(name, about | _about_errors(doubter), shifts_m)
+    about = {key: settings[key] for key in _KEPT}
+    trust = judge_cameras(chain.session, chain.views, seen, chain.room, is_still=is_still)
+    return tally.answer(name, about | _about_errors(doubter), shifts_m, trust)
+
+
+#: What is kept of the settings of a session.
+_KEPT = (
+    "session",
+    "session_sha256",
+    "cameras",
+    "frames",
+    "unseen",
+    "min_cameras",
+    "silhouettes",
+    "doubt",
+)
 
 
 def _about_errors(doubter: Doubter | None) -> dict[str, object]:
@@ -405,7 +432,11 @@ class _Tally:
         )
 
     def answer(
-        self, name: str, settings: dict[str, object], shifts_m: NDArray[np.float64]
+        self,
+        name: str,
+        settings: dict[str, object],
+        shifts_m: NDArray[np.float64],
+        agreement: SessionAgreement,
     ) -> SessionSpacing:
         """Return what all frames say together."""
         move = self._layout.move
@@ -451,6 +482,7 @@ class _Tally:
                 )
             },
             doubt=self._doubt() if self._is_doubted else None,
+            agreement=agreement,
         )
 
     def _doubt(self) -> SpacingDoubt:

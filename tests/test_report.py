@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from hybridve.calib.errors import ReportError
+from hybridve.hull.agreement.outlines import CUT, FIRST, Outline
 from hybridve.hull.contact.backtrack import FirstContact
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.detect import Body, Contact
@@ -131,6 +132,15 @@ def a_finding(draw: st.DrawFn, rng: np.random.Generator, body: Body) -> Finding:
     )
 
 
+def an_outline(rng: np.random.Generator) -> Outline:
+    pieces = [rng.uniform(0.0, 700.0, (rng.integers(3, 9), 2)) for _ in range(rng.integers(3))]
+    marks = [np.append(FIRST, np.zeros(len(piece) - 1)) for piece in pieces]
+    corners_px = np.concatenate([np.zeros((0, 2)), *pieces]).astype(np.float32)
+    cut = rng.choice([0, CUT], len(corners_px))
+    flat = (np.concatenate([np.zeros(0), *marks]) + cut).astype(np.uint8)
+    return Outline(corners_px, flat, bool(rng.integers(2)))
+
+
 @st.composite
 def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -144,7 +154,14 @@ def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
         state = draw(st.sampled_from(["unread", "contradictory"])) if reason else "evaluated"
         rests_on = draw(st.sampled_from(["", "left saw nothing"]))
         cameras = tuple(
-            CameraFrame(float(rng.uniform()), int(rng.integers(1 << 20)))
+            CameraFrame(
+                float(rng.uniform()),
+                int(rng.integers(1 << 20)),
+                float(rng.uniform()),
+                float(rng.uniform()),
+                bool(rng.integers(2)),
+                an_outline(rng),
+            )
             for _ in CAMERAS[: 0 if state == "unread" else None]
         )
         results.append(
@@ -193,6 +210,13 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
         np.testing.assert_array_equal(read["object_share"], expected)
         denied_px = [one.cameras[number].denied_px if one.cameras else 0 for one in results]
         assert read["denied_px"].tolist() == denied_px
+        for name in ("supported_share", "denies_share"):
+            shares = [
+                getattr(one.cameras[number], name) if one.cameras else np.nan for one in results
+            ]
+            np.testing.assert_array_equal(read[name], shares)
+        deny = [bool(one.cameras) and one.cameras[number].is_denier for one in results]
+        assert read["is_denier"].tolist() == deny
     assert list(report.objects) == ["object_0", "object_1"]
     for stage in STAGES:
         assert report.stage_s[stage].tolist() == [result.stage_s[stage] for result in results]
@@ -228,6 +252,38 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
                 np.testing.assert_array_equal(rows.patches["extent_m"][at], extent_m)
                 np.testing.assert_array_equal(rows.patches["clearance_m"][at], patch.clearance_m)
                 assert (rows.patches["triangles"][at], rows.patches["points"][at]) == (3, 2**40)
+
+
+@_FEW
+@given(results=frame_results())
+def test_outlines_are_read_from_the_parts_as_they_were_taken_in(
+    tmp_path: Path, results: list[FrameResult]
+) -> None:
+    with ReportWriter(tmp_path / "report.h5", a_header(2), overwrite=True) as writer:
+        for result in results[:-1]:
+            writer.append(result)
+        writer.outlines()  # makes a part of what is there
+        writer.append(results[-1])
+        found = writer.outlines()
+        writer.finish()
+
+    assert [frame.index for frame in found] == [result.index for result in results]
+    for frame, result in zip(found, results, strict=True):
+        assert len(frame.outlines) == len(result.cameras)
+        deny = [camera.is_denier for camera in result.cameras] or [False] * len(CAMERAS)
+        assert frame.deniers.tolist() == deny
+        for outline, camera in zip(frame.outlines, result.cameras, strict=True):
+            np.testing.assert_array_equal(outline.corners_px, camera.outline.corners_px)
+            np.testing.assert_array_equal(outline.marks, camera.outline.marks)
+            assert outline.is_inverse == camera.outline.is_inverse
+    with h5py.File(tmp_path / "report.h5") as file:
+        for number, camera in enumerate(CAMERAS):
+            stored = file[f"hybridve/cameras/{camera}/outline"]
+            ends = np.cumsum(
+                [len(one.outlines[number].marks) if one.outlines else 0 for one in found]
+            )
+            assert stored["offset"][1:].tolist() == ends.tolist()
+            assert len(stored["corners_px"]) == len(stored["marks"]) == ends[-1]
 
 
 def assert_place(found_m: NDArray[np.float64], expected_m: NDArray[np.float64]) -> None:

@@ -35,7 +35,7 @@ grown, holds a point, and at least half of the rays that were tried of the rest'
 the hull of the rest as it is (an estimate). If none is, all such pairs. Those are named that leave
 the others in the best agreement, or nearly so; with few cameras left, chance agrees, too.
 
-`disputes` looks closer where there is a hull: for large pieces of a silhouette that others deny.
+`coherence` looks closer where there is a hull: for large pieces of a silhouette that others deny.
 """
 
 import itertools
@@ -403,13 +403,46 @@ def deniers(found: Sequence[Dispute]) -> tuple[str, ...]:
     return tuple(sorted({name for name in named if named.count(name) > 1}))
 
 
-def disputes(
+@dataclass(frozen=True, slots=True, eq=False)
+class Coherence:
+    """How the silhouettes of one frame support and deny each other, square by square.
+
+    Attributes
+    ----------
+    supported_share : (C,) float64
+        Of each camera's squares of object pixels, the share of which it is not proved that the
+        others deny them; NaN where it has none, or there are too few cameras to tell.
+    denies_share : (C,) float64
+        Of the others' squares, the share that this camera alone denies; NaN likewise.
+    disputes : tuple of Dispute
+        Where squares are denied.
+    deniers : tuple of str
+        The cameras that deny pieces of two others' silhouettes at least: what two see and one
+        denies is more likely lacking in that one, or that one is not where the rig has it.
+    """
+
+    supported_share: NDArray[np.float64]
+    denies_share: NDArray[np.float64]
+    disputes: tuple[Dispute, ...] = ()
+    deniers: tuple[str, ...] = ()
+
+    @property
+    def reason(self) -> str:
+        """What is wrong with the frame, in words; empty where nobody denies what others see."""
+        if not self.deniers:
+            return ""
+        verb = "denies" if len(self.deniers) == 1 else "deny"
+        seen_by = [one.camera for one in self.disputes if set(one.denied_by) & set(self.deniers)]
+        return f"{', '.join(self.deniers)} {verb} what {', '.join(seen_by)} see"
+
+
+def coherence(
     hull: Hull,
     error_px: NDArray[np.int64] | int = DEFAULT_ERROR_PX,
     pencils: Pencils | None = None,
     sides_px: NDArray[np.int64] | int | None = None,
-) -> tuple[Dispute, ...]:
-    """Return the large pieces of silhouettes that others deny, beyond the stated error.
+) -> Coherence:
+    """Return how the silhouettes of one frame support and deny each other, beyond stated errors.
 
     A square of object pixels is denied where it is proved that no point of its rays is seen on an
     object pixel by so many cameras as are needed, and on background by none: by all but one with
@@ -431,15 +464,13 @@ def disputes(
     """
     views = hull.views
     count = len(views)
-    if count < 3:
-        return ()
+    needed = count - 1 if views.unseen == "carve" else max(views.min_cameras, 3)
+    if count < 3 or needed >= count:
+        return Coherence(np.full(count, np.nan), np.full(count, np.nan))
     errors = np.broadcast_to(np.asarray(error_px, np.int64), (count,)).copy()
     if sides_px is None:
         sides_px = np.maximum(4 * errors + 4, 8)
     sides = np.broadcast_to(np.asarray(sides_px, np.int64), (count,)).copy()
-    needed = count - 1 if views.unseen == "carve" else max(views.min_cameras, 3)
-    if needed >= count:
-        return ()
     blocks = find_blocks(
         make_pencils(views) if pencils is None else pencils,
         images_of(hull),
@@ -450,22 +481,41 @@ def disputes(
         sides,
         _BLOCK_CELLS,
     )
+    n_unconfirmed = np.bincount(blocks.unconfirmed[:, 0], minlength=count)
     found = []
-    for camera in range(count):
+    for camera in np.flatnonzero(n_unconfirmed).tolist():
         mine = blocks.unconfirmed[blocks.unconfirmed[:, 0] == camera, 1:]
-        if len(mine) == 0:
-            continue
         side = int(sides[camera])
         left, top = mine.min(axis=0).tolist()
         right, bottom = (mine.max(axis=0) + side).tolist()
-        deniers = np.flatnonzero(2 * blocks.n_denied[camera] > blocks.n_asked[camera])
+        by = np.flatnonzero(2 * blocks.n_denied[camera] > blocks.n_asked[camera])
         found.append(
             Dispute(
                 views.names[camera],
                 len(mine) * side * side,
                 len(mine) / int(blocks.n_blocks[camera]),
                 (left, top, right, bottom),
-                _names(views, deniers),
+                _names(views, by),
             )
         )
-    return tuple(found)
+    # Of the squares of which it was asked who denies them, as of all that are denied.
+    weights = n_unconfirmed / np.maximum(blocks.n_asked, 1)
+    denied = (blocks.n_denied * weights[:, None]).sum(axis=0)
+    others = blocks.n_blocks.sum() - blocks.n_blocks
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Coherence(
+            1.0 - n_unconfirmed / blocks.n_blocks, denied / others, tuple(found), deniers(found)
+        )
+
+
+def disputes(
+    hull: Hull,
+    error_px: NDArray[np.int64] | int = DEFAULT_ERROR_PX,
+    pencils: Pencils | None = None,
+    sides_px: NDArray[np.int64] | int | None = None,
+) -> tuple[Dispute, ...]:
+    """Return the large pieces of silhouettes that others deny, beyond the stated error.
+
+    Parameters are those of `coherence`.
+    """
+    return coherence(hull, error_px, pencils, sides_px).disputes

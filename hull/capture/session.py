@@ -6,7 +6,8 @@ mistake is told before any work starts. Frames themselves are read later, one at
 """
 
 import hashlib
-from dataclasses import dataclass, fields
+from collections.abc import Collection
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -152,6 +153,26 @@ class Session:
     def target(self) -> TargetTable | None:
         """The first board, if there is one."""
         return self.targets[0] if self.targets else None
+
+    def without(self, names: Collection[str]) -> "Session":
+        """Return the session as if it had not these cameras.
+
+        Raises
+        ------
+        SessionError
+            If it has no camera of such a name, or none is left.
+        """
+        known = [camera.name for camera in self.cameras]
+        for name in names:
+            if name not in known:
+                raise SessionError(
+                    f"{self.path}: there is no camera {name!r} to leave out; it has "
+                    f"{', '.join(known)}"
+                )
+        left = tuple(camera for camera in self.cameras if camera.name not in names)
+        if not left:
+            raise SessionError(f"{self.path}: without {', '.join(names)} no camera is left")
+        return replace(self, cameras=left, min_cameras=min(self.min_cameras, len(left)))
 
     @property
     def folder(self) -> Path:

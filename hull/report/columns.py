@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hybridve.hull.report.collisions import Runs, StoredMesh
 
 if TYPE_CHECKING:  # whoever only reads a report waits for none of these
+    from hybridve.hull.agreement.outlines import Outline
     from hybridve.hull.contact.backtrack import FirstContact
     from hybridve.hull.contact.clearance import Clearance
     from hybridve.hull.contact.detect import Contact
@@ -126,6 +127,63 @@ CAMERA_COLUMNS: tuple[Column[CameraFrame], ...] = (
         "the stated errors of outlines, at least; 0 of fewer than three cameras, which cannot tell",
         np.uint32,
         lambda camera: camera.denied_px,
+    ),
+    Column(
+        "supported_share",
+        "1",
+        "bound",
+        "share of the squares of its object pixels that the other cameras are not proved to deny, "
+        "at most; NaN without such squares, of fewer than three cameras, and of frames not read",
+        np.float64,
+        lambda camera: camera.supported_share,
+    ),
+    Column(
+        "denies_share",
+        "1",
+        "estimate",
+        "share of the others' squares that this camera alone denies; NaN likewise",
+        np.float64,
+        lambda camera: camera.denies_share,
+    ),
+    Column(
+        "is_denier",
+        "1",
+        "estimate",
+        "whether it denies pieces of the silhouettes of two others at least: such a frame is not "
+        "believed",
+        np.bool_,
+        lambda camera: camera.is_denier,
+    ),
+    Column(
+        "outline/is_inverse",
+        "1",
+        "exact",
+        "whether most of the picture is object, and the outline is that of what is not",
+        np.bool_,
+        lambda camera: camera.outline.is_inverse,
+    ),
+)
+
+#: Of each camera, any number of rows a frame.
+OUTLINE_COLUMNS: "tuple[Column[Outline], ...]" = (
+    Column(
+        "outline/corners_px",
+        "px",
+        "exact",
+        "corners of the convex hulls of the silhouette's pieces, piece after piece: centres of "
+        "pixels of the undistorted image, the centre of the top-left one being (0.5, 0.5)",
+        np.float32,
+        lambda outline: outline.corners_px,
+        shape=(2,),
+    ),
+    Column(
+        "outline/marks",
+        "1",
+        "exact",
+        "of each corner 1 if it is the first of its piece, and 2 if what the camera saw ends "
+        "there, added up",
+        np.uint8,
+        lambda outline: outline.marks,
     ),
 )
 
@@ -635,6 +693,7 @@ def offset_column(group: str, what: str) -> Column[NDArray[np.uint64]]:
 #: Which runs, patches and points belong to which frame; made from their numbers.
 RUN_OFFSET = offset_column("runs", "runs")
 PATCH_OFFSET = offset_column("patches", "patches")
+OUTLINE_OFFSET = offset_column("outline", "corners of the outline")
 POINT_OFFSET = offset_column("points", "collision points")
 
 #: Of each object, its mesh as it was asked about.

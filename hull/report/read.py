@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.plain import to_plain
+from hybridve.calib.plain import read_strictly, to_plain
+from hybridve.hull.agreement.record import SessionAgreement
 from hybridve.hull.contact.verdict import Facts, judge
 from hybridve.hull.report.collisions import Runs, StoredMesh
 from hybridve.hull.report.columns import (
@@ -148,6 +149,9 @@ class Report:
         By name.
     cameras : dict of dicts of (F,) arrays
         By name; empty for a report of version 1.
+    agreement : SessionAgreement
+        What the cameras say about each other in all frames together; of a report that was written
+        without asking, nothing.
     """
 
     path: Path
@@ -162,6 +166,7 @@ class Report:
     stage_s: dict[str, NDArray[np.float64]]
     objects: dict[str, ObjectColumns]
     cameras: dict[str, dict[str, NDArray[Any]]]
+    agreement: SessionAgreement
 
 
 def read_report(path: Path) -> Report:
@@ -200,7 +205,15 @@ def read_report(path: Path) -> Report:
                 name: _columns(group, CAMERA_COLUMNS, 0.0, may_be_absent=True)
                 for name, group in file.get("hybridve/cameras", {}).items()
             },
+            agreement=_agreement(file, path),
         )
+
+
+def _agreement(file: h5py.File, path: Path) -> SessionAgreement:
+    if "hybridve/settings/agreement" not in file:
+        return SessionAgreement()
+    told = json.loads(file["hybridve/settings/agreement"].asstr()[()])
+    return read_strictly(SessionAgreement, told, f"{path}: agreement")
 
 
 def _origin(file: h5py.File) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from hybridve.hull.report.machine import Run
 from hybridve.hull.report.result_file import Described
 
 if TYPE_CHECKING:  # whoever only reads a report waits for none of these
+    from hybridve.hull.agreement.outlines import Outline
     from hybridve.hull.contact.finding import Finding
 
 
@@ -56,10 +57,21 @@ class CameraFrame:
         The share of its picture that is object.
     denied_px : int
         Area of the pieces of it that are proved to be denied by others, square pixels.
+    supported_share, denies_share : float
+        Of its squares of object pixels, the share that the others are not proved to deny; of
+        theirs, the share that it denies. See `hybridve.hull.agreement.frame.Coherence`.
+    is_denier : bool
+        Whether it denies pieces of two others' silhouettes at least.
+    outline : Outline
+        Its outline.
     """
 
     object_share: float
     denied_px: int
+    supported_share: float
+    denies_share: float
+    is_denier: bool
+    outline: "Outline"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ which `kind` it is: exact, a bound given the silhouettes, or an estimate.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.plain import to_json
+from hybridve.calib.plain import read_strictly, to_json, to_plain
+from hybridve.hull.agreement.record import SessionAgreement
 from hybridve.hull.report.machine import Run
 from hybridve.hull.report.result_file import (
     Described,
@@ -208,6 +209,9 @@ class SessionSpacing:
         Per object that was not moved how many frames violate its clearance, and how many may.
     doubt : SpacingDoubt or None
         What errors do to all this; None where nothing was doubted.
+    agreement : SessionAgreement
+        What the cameras say about each other; where they contradict each other, nothing of all this
+        is to be trusted.
     """
 
     name: str
@@ -221,6 +225,7 @@ class SessionSpacing:
     frames: SpacingFrames
     standing: dict[str, tuple[int, int]]
     doubt: SpacingDoubt | None = None
+    agreement: SessionAgreement = field(default_factory=SessionAgreement)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,6 +311,8 @@ def _write_session(group: h5py.Group, one: SessionSpacing) -> None:
         for name in _BINDING:
             binding.attrs[name] = getattr(one.binding, name)
     store_text(group, "settings", json.dumps(one.settings), "what was recorded, JSON")
+    agreement = json.dumps(to_plain(one.agreement))
+    store_text(group, "agreement", agreement, "what the cameras say about each other, JSON")
     store(group, _FREE, one.free_m)
     store_fields(group.create_group("curve"), one.curve, _CURVE_COLUMNS)
     frames = group.create_group("frames")
@@ -370,6 +377,10 @@ def _read_session(name: str, group: h5py.Group) -> SessionSpacing:
             },
             object_name=found["object_name"],
         )
+    agreement = SessionAgreement()
+    if "agreement" in group:
+        told = json.loads(group["agreement"].asstr()[()])
+        agreement = read_strictly(SessionAgreement, told, f"sessions/{name}: agreement")
     return SessionSpacing(
         name=name,
         settings=json.loads(group["settings"].asstr()[()]),
@@ -390,6 +401,7 @@ def _read_session(name: str, group: h5py.Group) -> SessionSpacing:
         ),
         standing={key: _pair(counts) for key, counts in group["standing"].attrs.items()},
         doubt=_read_doubt(group["at_95"]) if "at_95" in group else None,
+        agreement=agreement,
     )
 
 
@@ -436,6 +448,8 @@ def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
     return {
         "name": one.name,
         "settings": one.settings,
+        "trusted": one.agreement.is_trusted,
+        "causes": to_json(one.agreement.causes),
         "shift_m": to_json(one.shift_m),
         "at_least_m": to_json(one.at_least_m),
         "at_95": None

@@ -20,9 +20,12 @@ def summarize(report: Report) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``verdict`` (the worst of all objects and frames), ``objects_by_verdict`` (how many have
-        which), ``report``, ``frames``, ``frames_invalid``, ``frames_contradictory`` (of these),
-        ``reasons`` (text to count) and ``reason_frames`` (text to numbers of frames),
+        ``trusted`` (whether the cameras agree so far that the session may be believed), ``causes``
+        (what is wrong with them; see `hybridve.hull.agreement.record.NamedCause`), ``cameras``
+        (by name, how they fit the others; see `CameraAgreement` there), ``verdict`` (the worst of
+        all objects and frames), ``objects_by_verdict`` (how many have which), ``report``,
+        ``frames``, ``frames_invalid``, ``frames_contradictory`` (of these), ``reasons`` (text to
+        count) and ``reason_frames`` (text to numbers of frames),
         ``rests_on`` (what the emptiness of frames without a hull rests on, to count),
         ``frames_without_hull`` (see `count_without_hull`), ``seconds`` (from first to last frame),
         ``engine``, ``renderer``, ``stage_ms_mean``, ``viewports`` (smallest and largest),
@@ -61,6 +64,9 @@ def summarize(report: Report) -> dict[str, Any]:
     objects.sort(key=_badness)
     verdicts = Counter(str(found["verdict"]) for found in objects)
     return {
+        "trusted": report.agreement.is_trusted,
+        "causes": to_json(report.agreement.causes),
+        "cameras": to_json(report.agreement.cameras),
         "verdict": worst(set(verdicts)),
         "objects_by_verdict": {one: verdicts[one] for one in VERDICTS if verdicts[one]},
         "report": str(report.path),
@@ -115,6 +121,8 @@ def count_without_hull(report: Report) -> int | None:
 def failing(summary: dict[str, Any], let_pass: Collection[str] = ()) -> list[str]:
     """Return the names of the objects of which not every frame says that they keep their distance.
 
+    Of a session that is not to be trusted, these are all, whatever is let pass.
+
     Parameters
     ----------
     summary : dict
@@ -126,7 +134,9 @@ def failing(summary: dict[str, Any], let_pass: Collection[str] = ()) -> list[str
     return [
         found["name"]
         for found in summary["objects"]
-        if not found["frames_by_verdict"] or not good.issuperset(found["frames_by_verdict"])
+        if not summary["trusted"]
+        or not found["frames_by_verdict"]
+        or not good.issuperset(found["frames_by_verdict"])
     ]
 
 

@@ -24,12 +24,17 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
 from hybridve.calib.files import appearing
+from hybridve.calib.plain import to_plain
+from hybridve.hull.agreement.outlines import FrameOutlines, Outline
+from hybridve.hull.agreement.record import SessionAgreement
 from hybridve.hull.contact.finding import Finding
 from hybridve.hull.report.collisions import Runs, StoredMesh
 from hybridve.hull.report.columns import (
     CAMERA_COLUMNS,
     FRAME_COLUMNS,
     MESH_COLUMNS,
+    OUTLINE_COLUMNS,
+    OUTLINE_OFFSET,
     PATCH_COLUMNS,
     PATCH_OFFSET,
     POINT_COLUMNS,
@@ -42,6 +47,7 @@ from hybridve.hull.report.machine import utc_now
 from hybridve.hull.report.result_file import STORED, store, store_text, write_run, writing
 from hybridve.hull.report.schema import VERSION, Column, FrameResult, ReportHeader
 from hybridve.hull.report.vtk import MOST_SHOWN, FramePoints, add_vtkhdf
+from hybridve.hull.report.withdraw import doubted, withdrawn
 
 #: A part is finished after this many frames or runs of collision points, whichever comes first.
 _PART_FRAMES = 64
@@ -158,14 +164,32 @@ class ReportWriter:
             with np.load(part) as columns:
                 yield {key: columns[key] for key in columns.files if is_wanted(key)}
 
-    def finish(self) -> None:
-        """Make the parts the report."""
+    def outlines(self) -> list[FrameOutlines]:
+        """Return the outlines of all frames that were taken in, in this run or one before."""
+        self._flush()
+        frames: list[FrameOutlines] = []
+        cameras = range(len(self._header.cameras))
+        for part in self._part_columns(lambda key: key.startswith(("camera/", "frame/"))):
+            each = [_outlines(part, number) for number in cameras]
+            deniers = np.array([part[_camera_key(number, "is_denier")] for number in cameras])
+            for row, index in enumerate(part[_frame_key("index")].tolist()):
+                is_read = part[_frame_key("state")][row] != "unread"
+                outlines = tuple(of_camera[row] for of_camera in each) if is_read else ()
+                frames.append(FrameOutlines(index, outlines, deniers[:, row]))
+        return frames
+
+    def finish(self, agreement: SessionAgreement | None = None) -> None:
+        """Make the parts the report.
+
+        What the cameras of the whole session say about each other, if they were asked, takes back
+        what single frames have said too surely.
+        """
         self._flush()
         with writing(self._path) as file:
-            self._write(file)
+            self._write(file, agreement or SessionAgreement())
         shutil.rmtree(self._parts)
 
-    def _write(self, file: h5py.File) -> None:
+    def _write(self, file: h5py.File, agreement: SessionAgreement) -> None:
         header = self._header
         write_run(file, "report", VERSION, replace(header.run, created_utc=utc_now()))
         file.attrs["engine"] = header.engine
@@ -173,6 +197,11 @@ class ReportWriter:
         for name, value, description in (
             ("configuration", header.settings, "the resolved configuration, JSON"),
             ("rig", header.rig, "the rig as in rig.json, each camera with mask_shift_px, JSON"),
+            (
+                "agreement",
+                to_plain(agreement),
+                "what the cameras say about each other in all frames together, JSON",
+            ),
         ):
             store_text(file, f"hybridve/settings/{name}", json.dumps(value), description)
         self._store(file["hybridve/settings"], _ORIGIN, np.array(header.local_origin_m))
@@ -182,6 +211,7 @@ class ReportWriter:
         if not rows:
             raise ReportError(f"{self._path}: no frame was evaluated; there is nothing to report")
         whole = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
+        self._take_back(whole, agreement)
         frames = file.create_group("hybridve/frames")
         for column in FRAME_COLUMNS:
             self._store(frames, column, whole[_frame_key(column.name)])
@@ -190,6 +220,13 @@ class ReportWriter:
             group = cameras.create_group(name)
             for camera_column in CAMERA_COLUMNS:
                 self._store(group, camera_column, whole[_camera_key(number, camera_column.name)])
+            self._store_many(
+                group,
+                partial(_camera_key, number),
+                OUTLINE_OFFSET,
+                OUTLINE_COLUMNS,
+                whole[_camera_key(number, "n_corners")],
+            )
         objects = file.create_group("hybridve/objects", track_order=True)  # the scene's order
         for number, about in enumerate(header.objects):
             group = objects.create_group(about["name"])
@@ -203,7 +240,8 @@ class ReportWriter:
                 (RUN_OFFSET, RUN_COLUMNS, "n_runs"),
                 (PATCH_OFFSET, PATCH_COLUMNS, "n_patches"),
             ):
-                self._store_many(group, number, offset, columns, whole[_object_key(number, count)])
+                key = partial(_object_key, number)
+                self._store_many(group, key, offset, columns, whole[key(count)])
             self._store_mesh(file, group, header.meshes[number])
             if header.points == "all":
                 self._store_points(group, number, whole[_object_key(number, "n_points")])
@@ -214,6 +252,21 @@ class ReportWriter:
             [self._points(number) for number in range(len(header.objects))],
             is_sample=header.points == "sample",
         )
+
+    def _take_back(self, whole: dict[str, NDArray[Any]], agreement: SessionAgreement) -> None:
+        """Replace what frames have said more surely than all of them together allow."""
+        index = whole[_frame_key("index")].astype(np.int64)
+        excess_px = agreement.excess_px(self._header.cameras, index)
+        wrong = [agreement.distrust or reason for reason in agreement.wrong(index)]
+        for number in range(len(self._header.objects)):
+            key = partial(_object_key, number)
+            verdict, reason, certificate = map(key, ("verdict", "reason", "certificate"))
+            whole[verdict], whole[reason], whole[certificate] = withdrawn(
+                whole[verdict], whole[reason], whole[certificate], wrong
+            )
+            at_least = key("clearance_at_least_m")
+            if at_least in whole:
+                whole[at_least] = doubted(whole[at_least], whole[key("m_per_px")], excess_px)
 
     def _store(self, group: h5py.Group, column: Column[Any], values: NDArray[Any]) -> None:
         if column.dtype is str:
@@ -229,7 +282,7 @@ class ReportWriter:
     def _store_many(
         self,
         group: h5py.Group,
-        number: int,
+        key_of: Callable[[str], str],
         offset: Column[Any],
         columns: Sequence[Column[Any]],
         counts: NDArray[np.int64],
@@ -238,7 +291,7 @@ class ReportWriter:
         ends = np.concatenate([[0], np.cumsum(counts, dtype=np.uint64)]).astype(np.uint64)
         self._store(group, offset, ends)
         for column in columns:
-            key = _object_key(number, column.name)
+            key = key_of(column.name)
             parts = (part[key] for part in self._part_columns(partial(operator.eq, key)))
             self._store_parts(group, column, int(ends[-1]), parts)
 
@@ -357,7 +410,9 @@ _ORIGIN: Column[Any] = Column(
 )
 
 #: Ends of the keys under which a part keeps what a frame has any number of.
-_MANY = (*(run.name for run in RUN_COLUMNS), *(patch.name for patch in PATCH_COLUMNS))
+_MANY = tuple(
+    column.name for columns in (RUN_COLUMNS, PATCH_COLUMNS, OUTLINE_COLUMNS) for column in columns
+)
 
 
 def _frame_key(name: str) -> str:
@@ -383,6 +438,14 @@ def _columns(results: list[FrameResult], header: ReportHeader) -> dict[str, NDAr
         cameras = [result.cameras[number] if result.cameras else None for result in results]
         for camera_column in CAMERA_COLUMNS:
             columns[_camera_key(number, camera_column.name)] = values(camera_column, cameras)
+        outlines = [Outline.empty() if one is None else one.outline for one in cameras]
+        columns[_camera_key(number, "n_corners")] = np.array(
+            [len(one.marks) for one in outlines], np.int64
+        )
+        for outline_column in OUTLINE_COLUMNS:
+            columns[_camera_key(number, outline_column.name)] = np.concatenate(
+                [outline_column.take(one) for one in outlines]
+            )
     for number in range(len(header.objects)):
         findings = [result.findings[number] if result.is_valid else None for result in results]
         for table in tables_of(header.parts):
@@ -403,6 +466,19 @@ def _columns(results: list[FrameResult], header: ReportHeader) -> dict[str, NDAr
         for patch_column in PATCH_COLUMNS:
             columns[_object_key(number, patch_column.name)] = values(patch_column, every)
     return columns
+
+
+def _outlines(part: dict[str, NDArray[Any]], number: int) -> list[Outline]:
+    """Return the outlines of one camera in the frames of a part."""
+    ends = part[_camera_key(number, "n_corners")].cumsum()
+    corners, marks, is_inverse = (
+        part[_camera_key(number, f"outline/{name}")]
+        for name in ("corners_px", "marks", "is_inverse")
+    )
+    return [
+        Outline(corners[start:stop], marks[start:stop], bool(inverse))
+        for start, stop, inverse in zip([0, *ends[:-1].tolist()], ends, is_inverse, strict=True)
+    ]
 
 
 _NO_RUNS = Runs(np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros(0, np.uint32))

@@ -1,0 +1,209 @@
+"""Whether a session is to be trusted: what its frames give to that, and the judgement of all.
+
+::
+
+    Hull (one frame) -> FrameOutlines -+
+    room of the empty scene -----------+-> SessionAgreement
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.calib.lens import Undistortion
+from hybridve.calib.rig import Rig
+from hybridve.hull.agreement.causes import GROSS_BUMP_PX
+from hybridve.hull.agreement.frame import (
+    DEFAULT_ERROR_PX,
+    Coherence,
+    coherence,
+    stated_error_px,
+)
+from hybridve.hull.agreement.outlines import FrameOutlines, inner_of, outline_of
+from hybridve.hull.agreement.pieces import drop_unconfirmed
+from hybridve.hull.agreement.record import NamedCause, SessionAgreement
+from hybridve.hull.agreement.search import Pencils, make_pencils
+from hybridve.hull.agreement.session import judge_session
+from hybridve.hull.capture.recording import Mask, undistort_mask
+from hybridve.hull.capture.room_check import RoomCheck
+from hybridve.hull.capture.session import Session
+from hybridve.hull.capture.tracks import Tracks, read_tracks
+from hybridve.hull.chain import first_rig, moved_views, rig_views
+from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Witness:
+    """Looks at the silhouettes of each frame of a session.
+
+    Attributes
+    ----------
+    inners : list of C (H, W) uint8, or None
+        Where each camera recorded all pixels around; see
+        `hybridve.hull.agreement.outlines.inner_of`.
+    error_px : (C,) int64
+        By how much each outline may be off.
+    pencils : Pencils or None
+        Of the cameras, if they stand still.
+    """
+
+    inners: list[NDArray[np.uint8] | None]
+    error_px: NDArray[np.int64]
+    pencils: Pencils | None
+
+    @classmethod
+    def of(
+        cls,
+        views: Views,
+        undistortions: Sequence[Undistortion],
+        sigma_px: NDArray[np.float64] | None = None,
+        *,
+        is_still: bool,
+    ) -> Self:
+        """Return one for cameras whose outlines have standard deviations (C,), if they are known.
+
+        Parameters
+        ----------
+        views : Views
+            C cameras.
+        undistortions : sequence of Undistortion
+            How their images became pinhole images.
+        sigma_px : (C,) float64, optional
+            Standard deviations of their outlines, pixels.
+        is_still : bool
+            Whether no camera moves.
+        """
+        error_px = np.full(len(views), DEFAULT_ERROR_PX, np.int64)
+        if sigma_px is not None:
+            error_px = stated_error_px(sigma_px)
+        inners = [inner_of(lens.seen) for lens in undistortions]
+        return cls(inners, error_px, make_pencils(views) if is_still else None)
+
+    def look(self, index: int, hull: Hull) -> tuple[Coherence, FrameOutlines]:
+        """Return what the silhouettes of a frame say of each other, and what is kept of them."""
+        names = hull.views.names
+        found = coherence(hull, self.error_px, self.pencils)
+        outlines = tuple(
+            outline_of(hull.mask(camera), inner) for camera, inner in enumerate(self.inners)
+        )
+        return found, FrameOutlines(index, outlines, np.isin(names, found.deniers))
+
+
+def unread(index: int, n_cameras: int) -> FrameOutlines:
+    """Return what is kept of a frame that could not be read."""
+    return FrameOutlines(index, (), np.zeros(n_cameras, np.bool_))
+
+
+def judge_cameras(
+    session: Session,
+    views: Views,
+    frames: Sequence[FrameOutlines],
+    room: RoomCheck,
+    *,
+    is_still: bool,
+) -> SessionAgreement:
+    """Return what the cameras of a session say about each other, and what the empty room does.
+
+    Of cameras that move only the empty room is asked.
+
+    Parameters
+    ----------
+    session : Session
+        Whose cameras.
+    views : Views
+        Their images.
+    frames : sequence of FrameOutlines
+        Of all frames, those that were not read among them.
+    room : RoomCheck
+        What the empty scene shows of the room in which they were calibrated.
+    is_still : bool
+        Whether no camera moves.
+    """
+    found = SessionAgreement()
+    if is_still:
+        found = judge_session(
+            views,
+            frames,
+            offset_s={camera.name: camera.shift_frames / session.fps for camera in session.cameras},
+            fps=session.fps,
+        )
+    if not frames:
+        return found
+    moved = tuple(
+        NamedCause(
+            kind="moved",
+            cameras=(name,),
+            first_frame=frames[0].index,
+            last_frame=frames[-1].index,
+            is_gross=(room.cameras[name].largest_px or np.inf) >= GROSS_BUMP_PX,
+            message=message,
+            size=room.cameras[name].largest_px,
+            high=room.cameras[name].largest_px,
+        )
+        for name, message in zip(room.moved, room.messages, strict=True)
+    )
+    return replace(found, causes=(*moved, *found.causes)) if moved else found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Desk:
+    """Where silhouettes are looked through as they are cut out, before they are stored.
+
+    Attributes
+    ----------
+    session : Session
+        Whose they are.
+    rig : Rig
+        Its cameras.
+    room : RoomCheck
+        What the empty scene shows.
+    tracks : Tracks
+        Where moving cameras were.
+    views, lenses
+        What `hybridve.hull.chain.rig_views` gives.
+    witness : Witness
+        Looks at them.
+    frames : list of FrameOutlines
+        What it has seen.
+    """
+
+    session: Session
+    rig: Rig
+    room: RoomCheck
+    tracks: Tracks
+    views: Views
+    lenses: list[Undistortion]
+    witness: Witness
+    frames: list[FrameOutlines]
+
+    @classmethod
+    def of(cls, session: Session, rig: Rig, room: RoomCheck) -> Self:
+        """Return an empty one."""
+        tracks = read_tracks(session, rig)
+        views, lenses = rig_views(session, first_rig(rig, tracks))
+        witness = Witness.of(views, lenses, is_still=not tracks)
+        return cls(session, rig, room, tracks, views, lenses, witness, [])
+
+    def take(self, index: int, masks: list[Mask] | None) -> list[Mask] | None:
+        """Return a frame's silhouettes (H, W), as recorded, without what no other camera confirms.
+
+        Where nobody knows what a camera sees, nothing is dropped.
+        """
+        if masks is None or self.tracks.missing(index):
+            self.frames.append(unread(index, len(self.views)))
+            return masks
+        views = moved_views(self.session, self.rig, self.tracks, index, self.views, self.lenses)
+        undistorted = [
+            undistort_mask(mask, lens) for mask, lens in zip(masks, self.lenses, strict=True)
+        ]
+        self.frames.append(self.witness.look(index, make_hull(views, undistorted))[1])
+        return drop_unconfirmed(views, self.lenses, masks)
+
+    def judge(self) -> SessionAgreement:
+        """Return what the cameras say about each other in all frames that were taken."""
+        return judge_cameras(
+            self.session, self.views, self.frames, self.room, is_still=not self.tracks
+        )
