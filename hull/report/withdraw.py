@@ -52,4 +52,4 @@ def doubted(
         By how much more each outline may be off.
     """
     less_m = (np.nan_to_num(m_per_px) * excess_px).sum(axis=1)
-    return np.where(np.isnan(at_least_m), at_least_m, np.maximum(0.0, at_least_m - less_m))
+    return np.where(less_m > 0.0, np.maximum(0.0, at_least_m - less_m), at_least_m)
