@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.hull.about import resolved_settings
 from hybridve.hull.agreement.frame import judge_frame
+from hybridve.hull.agreement.outlines import FrameOutlines
 from hybridve.hull.agreement.record import SessionAgreement
 from hybridve.hull.cad.scene import Scene, SceneObject, load_scene
 from hybridve.hull.capture.session import load_session
@@ -53,7 +54,7 @@ from hybridve.hull.report.spacing_file import (
     SpacingFrames,
     make_stretches,
 )
-from hybridve.hull.trust import Witness, judge_cameras, unread
+from hybridve.hull.trust import Witness, judge_cameras
 from hybridve.hull.watcher import Watcher
 
 #: Points of a curve at most; what a frame blocks is known for all shifts anyway.
@@ -298,11 +299,12 @@ def replay(
     with closing(hulls(chain, progress=progress)) as frames:
         for frame in frames:
             if frame.hull is None:
-                seen.append(unread(frame.index, len(chain.views)))
+                seen.append(FrameOutlines.unread(frame.index, len(chain.views)))
                 tally.leave_out(frame.index, frame.time_s, frame.reason)
             else:
-                seen.append(witness.look(frame.index, frame.hull)[1])
                 agreement = judge_frame(frame.hull, witness.error_px, witness.pencils)
+                _, kept = witness.look(frame.index, frame.hull)
+                seen.append(replace(kept, is_contradictory=agreement.is_contradictory))
                 if agreement.is_contradictory:  # its hull is empty, its room is not
                     tally.leave_out(frame.index, frame.time_s, agreement.reason)
                     advance()

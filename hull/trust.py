@@ -28,6 +28,7 @@ from hybridve.hull.agreement.record import NamedCause, SessionAgreement
 from hybridve.hull.agreement.search import Pencils, make_pencils
 from hybridve.hull.agreement.session import judge_session
 from hybridve.hull.capture.recording import Mask, undistort_mask
+from hybridve.hull.capture.resemblance import unlike_rooms
 from hybridve.hull.capture.room_check import RoomCheck
 from hybridve.hull.capture.session import Session
 from hybridve.hull.capture.tracks import Tracks, read_tracks
@@ -89,12 +90,8 @@ class Witness:
         outlines = tuple(
             outline_of(hull.mask(camera), inner) for camera, inner in enumerate(self.inners)
         )
-        return found, FrameOutlines(index, outlines, np.isin(names, found.deniers))
-
-
-def unread(index: int, n_cameras: int) -> FrameOutlines:
-    """Return what is kept of a frame that could not be read."""
-    return FrameOutlines(index, (), np.zeros(n_cameras, np.bool_))
+        deniers = np.isin(names, found.deniers)
+        return found, FrameOutlines(index, outlines, deniers, found.supported_share)
 
 
 def judge_cameras(
@@ -132,6 +129,7 @@ def judge_cameras(
         )
     if not frames:
         return found
+    found = _with_rooms(session, found, frames)
     moved = tuple(
         NamedCause(
             kind="moved",
@@ -139,6 +137,7 @@ def judge_cameras(
             first_frame=frames[0].index,
             last_frame=frames[-1].index,
             is_gross=(room.cameras[name].largest_px or np.inf) >= GROSS_BUMP_PX,
+            short=f"{name} has moved since it was calibrated",
             message=message,
             size=room.cameras[name].largest_px,
             high=room.cameras[name].largest_px,
@@ -146,6 +145,40 @@ def judge_cameras(
         for name, message in zip(room.moved, room.messages, strict=True)
     )
     return replace(found, causes=(*moved, *found.causes)) if moved else found
+
+
+def _with_rooms(
+    session: Session, found: SessionAgreement, frames: Sequence[FrameOutlines]
+) -> SessionAgreement:
+    """Return the same, with recordings that do not show their own room named.
+
+    Against an empty scene that is not its own all of a picture is object, and outlines tell
+    nothing.
+    """
+    unlike = unlike_rooms(session)
+    named = {name for _, cameras in unlike for name in cameras}
+    causes = tuple(
+        NamedCause(
+            kind=kind,
+            cameras=cameras,
+            first_frame=frames[0].index,
+            last_frame=frames[-1].index,
+            is_gross=True,
+            short=f"{' and '.join(cameras)} {kind}",
+            message=(
+                f"{' and '.join(cameras)} have each other's recording: each looks like the other's "
+                "empty scene, and not like its own; exchange their recordings in session.toml"
+            )
+            if kind == "exchanged"
+            else (
+                f"{cameras[0]}'s recording is {kind}: so changed it looks like the empty scene, "
+                "and as it is it does not; turn it back"
+            ),
+        )
+        for kind, cameras in unlike
+    )
+    others = (cause for cause in found.causes if not named & set(cause.cameras))
+    return replace(found, causes=(*causes, *others)) if unlike else found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,7 +226,7 @@ class Desk:
         Where nobody knows what a camera sees, nothing is dropped.
         """
         if masks is None or self.tracks.missing(index):
-            self.frames.append(unread(index, len(self.views)))
+            self.frames.append(FrameOutlines.unread(index, len(self.views)))
             return masks
         views = moved_views(self.session, self.rig, self.tracks, index, self.views, self.lenses)
         undistorted = [

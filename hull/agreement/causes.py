@@ -16,7 +16,7 @@ A camera whose outlines fit none of the others for most of the session, whatever
 **contradictory**: something is wrong with it that is not in this list.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Literal
@@ -95,8 +95,10 @@ _FRAME_PX, _FRAME_SHARE, _OTHERS_PX = 4.0, 0.8, 1.5
 #: And by so many pixels worse in the middle one of them.
 _FRAME_MEDIAN_PX = 6.0
 
-#: A camera that fits none for more than this share of the frames contradicts the session.
-_MOST_FRAMES = 0.5
+#: A camera contradicts the session whose outlines fit the others no better than this, in pixels
+#: (15 is the most), if they support no more than this share of its silhouette; or that denies what
+#: they see in more than this share of the frames.
+_CONTRADICTORY_PX, _SUPPORTED, _MOST_FRAMES = 9.0, 0.7, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,8 +169,27 @@ class Diagnosis:
     is_told: bool
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameVerdicts:
+    """What F frames say by themselves of C cameras; see `hybridve.hull.agreement.frame`.
+
+    Attributes
+    ----------
+    denies : (F, C) bool
+        Whether each camera denies what several others see.
+    supported_share : (F, C) float64
+        How much of its silhouette the others support; NaN where nobody can tell.
+    is_contradictory : (F,) bool
+        Whether no point is in all silhouettes.
+    """
+
+    denies: NDArray[np.bool_]
+    supported_share: NDArray[np.float64]
+    is_contradictory: NDArray[np.bool_]
+
+
 def diagnose(
-    trial: Trial, denies: NDArray[np.bool_] | None = None, *, with_clock: bool = True
+    trial: Trial, said: FrameVerdicts | None = None, *, with_clock: bool = True
 ) -> Diagnosis:
     """Return what is wrong with the cameras of a session, as their silhouettes tell.
 
@@ -176,9 +197,8 @@ def diagnose(
     ----------
     trial : Trial
         The outlines of F frames of C cameras.
-    denies : (F, C) bool, optional
-        In which frames each camera denies what several others see; see
-        `hybridve.hull.agreement.frame`.
+    said : FrameVerdicts, optional
+        What the frames say by themselves.
     with_clock : bool
         Whether delays are looked for: the frames are not far apart.
     """
@@ -191,11 +211,13 @@ def diagnose(
         if cause is None:
             break
         causes.append(cause)
+    # Pictures that were put right as pictures are, about their middles, are a few pixels off.
+    put_right = {name for cause in causes for name in cause.cameras}
     # What is left of each camera, what was undone of it added.
     undone = {name: np.zeros(3) for name in names}
     offsets = [offset_of(trial, camera, far=with_clock) for camera in range(len(names))]
     for _ in range(_MOST_CAUSES):
-        found, trial = _fine(trial, offsets, with_clock=with_clock)
+        found, trial = _fine(trial, offsets, put_right, with_clock=with_clock)
         if not found:
             break
         causes += found
@@ -205,7 +227,8 @@ def diagnose(
             elif cause.first == 0:
                 undone[cause.cameras[0]][:2] += cause.moved_px
         offsets = [offset_of(trial, camera, far=False) for camera in range(len(names))]
-    causes += _frames(trial, denies, causes)
+    causes += _contradictory(trial, said, causes)
+    causes += _frames(trial, None if said is None else said.denies, causes)
     offsets = [
         replace(
             offset, moved_px=offset.moved_px + undone[name][:2], late=offset.late + undone[name][2]
@@ -295,11 +318,13 @@ def _is_gross_gain(cause: Cause) -> bool:
 
 
 def _fine(
-    trial: Trial, offsets: Sequence[Offset], *, with_clock: bool
+    trial: Trial, offsets: Sequence[Offset], but: Collection[str], *, with_clock: bool
 ) -> tuple[list[Cause], Trial]:
     """Return the delay and the bump of the camera that explain most, and the session without."""
     tried: list[_Tried] = []
     for camera, offset in enumerate(offsets):
+        if trial.views.names[camera] in but:
+            continue
         tried += _tries(trial, camera, offset, with_clock=with_clock)
     best = max(tried, key=lambda one: one.gain_px, default=None)
     if best is None:
@@ -411,12 +436,34 @@ def _bumped(trial: Trial, camera: int, step: Step, before: Misfit, after: Misfit
     )
 
 
-def _frames(trial: Trial, denies: NDArray[np.bool_] | None, causes: Sequence[Cause]) -> list[Cause]:
-    """Return runs of frames in which one camera's silhouettes fit none of the others.
+def _contradictory(
+    trial: Trial, said: FrameVerdicts | None, causes: Sequence[Cause]
+) -> list[Cause]:
+    """Return the cameras that contradict the others most of the time, whatever was tried."""
+    named = {name for cause in causes for name in cause.cameras}
+    last = trial.table.n_frames - 1
+    found = []
+    for camera, name in enumerate(trial.views.names):
+        if name in named:
+            continue
+        fit = trial.misfit([camera])
+        is_off = fit.count >= LEAST_COUNT and fit.px >= _CONTRADICTORY_PX
+        if said is not None:
+            told = np.isfinite(said.supported_share[:, camera])
+            if told.any() and np.median(said.supported_share[told, camera]) > _SUPPORTED:
+                is_off = False
+            is_off = is_off or said.denies[:, camera].mean() > _MOST_FRAMES
+        if is_off:
+            found.append(Cause("contradictory", (name,), 0, last, before_px=fit.px))
+    is_gross = any(cause.is_gross for cause in [*causes, *found])
+    if said is not None and not is_gross and said.is_contradictory.mean() > _MOST_FRAMES:
+        found.append(Cause("contradictory", (), 0, last))
+    return found
 
-    If these are most of them, and nothing explains it, the camera is contradictory.
-    """
-    count, n_frames = len(trial.views), trial.table.n_frames
+
+def _frames(trial: Trial, denies: NDArray[np.bool_] | None, causes: Sequence[Cause]) -> list[Cause]:
+    """Return runs of frames in which one camera's silhouettes fit none of the others."""
+    count = len(trial.views)
     if count < 3:
         return []
     gross = {name for cause in causes if cause.is_gross for name in cause.cameras}
@@ -425,9 +472,7 @@ def _frames(trial: Trial, denies: NDArray[np.bool_] | None, causes: Sequence[Cau
         is_wrong, excess = _wrong_frames(trial, camera)
         if denies is not None and not gross:  # with a gross cause, who denies whom says nothing
             is_wrong = is_wrong | denies[:, camera]
-        if is_wrong.mean() > _MOST_FRAMES:
-            if name not in gross:
-                found.append(Cause("contradictory", (name,), 0, n_frames - 1))
+        if name in gross:
             continue
         starts = np.flatnonzero(is_wrong & ~np.append(False, is_wrong[:-1]))
         stops = np.flatnonzero(is_wrong & ~np.append(is_wrong[1:], False))

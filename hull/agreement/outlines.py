@@ -110,11 +110,23 @@ class FrameOutlines:
         Empty where the frame was not read.
     deniers : (C,) bool
         The cameras that deny what several others see.
+    supported_share : (C,) float64
+        How much of each silhouette the others support; NaN where nobody can tell.
+    is_contradictory : bool
+        Whether no point is in all silhouettes, by more than they err.
     """
 
     index: int
     outlines: tuple[Outline, ...]
     deniers: NDArray[np.bool_]
+    supported_share: NDArray[np.float64]
+    is_contradictory: bool = False
+
+    @classmethod
+    def unread(cls, index: int, n_cameras: int) -> Self:
+        """Return what is kept of a frame that could not be read."""
+        nothing = np.full(n_cameras, np.nan)
+        return cls(index, (), np.zeros(n_cameras, np.bool_), nothing)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

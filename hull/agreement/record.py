@@ -26,6 +26,8 @@ class NamedCause(Told):
         Numbers of frames of the session.
     is_gross : bool
         Whether nothing that these frames say is to be trusted.
+    short : str
+        What was found, in a few words.
     message : str
         What was found, what was expected, and what to do: one line.
     size, low, high : float or None
@@ -41,6 +43,7 @@ class NamedCause(Told):
     first_frame: int
     last_frame: int
     is_gross: bool
+    short: str
     message: str
     size: float | None = None
     low: float | None = None
@@ -100,7 +103,8 @@ class SessionAgreement(Told):
     @property
     def distrust(self) -> str:
         """Why it may not, in words; empty if it may."""
-        return "; ".join(cause.message for cause in self.causes if cause.is_gross)
+        gross = [cause.short for cause in self.causes if cause.is_gross]
+        return f"the session is not to be trusted: {'; '.join(gross)}" if gross else ""
 
     def wrong(self, index: NDArray[np.int64]) -> list[str]:
         """Return of each frame number (F,) why that frame is not to be believed; else empty."""
@@ -109,7 +113,7 @@ class SessionAgreement(Told):
             if cause.kind != "frames":
                 continue
             for row in np.flatnonzero((index >= cause.first_frame) & (index <= cause.last_frame)):
-                reasons[row] = "; ".join(filter(None, [reasons[row], cause.message]))
+                reasons[row] = "; ".join(filter(None, [reasons[row], cause.short]))
         return reasons
 
     def excess_px(self, names: Sequence[str], index: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.agreement.causes import Cause, Diagnosis, diagnose
+from hybridve.hull.agreement.causes import Cause, Diagnosis, FrameVerdicts, diagnose
 from hybridve.hull.agreement.offsets import Offset
 from hybridve.hull.agreement.outlines import FrameOutlines, Outline, table_of
 from hybridve.hull.agreement.record import (
@@ -18,7 +18,7 @@ from hybridve.hull.agreement.record import (
     NamedCause,
     SessionAgreement,
 )
-from hybridve.hull.agreement.told import message_of
+from hybridve.hull.agreement.told import message_of, short_of
 from hybridve.hull.agreement.trials import Trial
 from hybridve.hull.query.silhouettes import Views
 
@@ -56,10 +56,14 @@ def judge_session(
         return SessionAgreement()
     nothing = (Outline.empty(),) * len(views)
     table = table_of([frame.outlines or nothing for frame in frames])
-    denies = np.array([frame.deniers for frame in frames])
     index = np.array([frame.index for frame in frames], np.int64)
     step = int(index[1] - index[0]) if len(index) > 1 else 1
-    found = diagnose(Trial.of(views, table), denies, with_clock=step <= _LARGEST_STEP)
+    said = FrameVerdicts(
+        np.array([frame.deniers for frame in frames]),
+        np.array([frame.supported_share for frame in frames]),
+        np.array([frame.is_contradictory for frame in frames]),
+    )
+    found = diagnose(Trial.of(views, table), said, with_clock=step <= _LARGEST_STEP)
     return SessionAgreement(
         found.is_told,
         tuple(
@@ -87,12 +91,13 @@ def _named(
         first,
         last,
         cause.is_gross,
+        short_of(cause),
         message_of(
             cause,
             frames=(first, last, int(index[-1]), int(index[0])),
             per_row=per_row,
             late_s=late_s,
-            offset_s=offset_s.get(cause.cameras[0], 0.0),
+            offset_s=offset_s.get(cause.cameras[0], 0.0) if cause.cameras else 0.0,
         ),
         size,
         low,

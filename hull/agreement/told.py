@@ -76,15 +76,28 @@ def message_of(
         by = f", by {cause.size:.1f} px more than usual" if cause.size == cause.size else ""
         return (
             f"{who}'s silhouettes of {when} fit none of the others{by}; look at them "
-            "(`hybridve segment --pictures`), or leave the camera out with "
+            "(`hybridve render --view cameras`), or leave the camera out with "
             f"--drop-camera {who}"
         )
-    share = f"frames {start} to {end}"
+    whom = f"{who} contradicts the others" if who else "the silhouettes contradict each other"
+    leave = f", or leave it out with --drop-camera {who}" if who else ""
     return (
-        f"{who} contradicts the others most of the time ({share}), and nothing that was tried "
-        "explains it (exchanged, mirrored, turned, late, bumped); look at its silhouettes and its "
-        f"pose, or leave it out with --drop-camera {who}"
+        f"{whom} most of the time (frames {start} to {end}), and nothing that was tried explains "
+        "it (exchanged, mirrored, turned, inverted, late, bumped); look at the silhouettes "
+        f"(`hybridve render --view cameras`), at backgrounds and poses{leave}"
     )
+
+
+def short_of(cause: Cause) -> str:
+    """Return a cause in a few words."""
+    who = " and ".join(cause.cameras)
+    if not who:
+        return "the silhouettes contradict each other"
+    if cause.kind == "frames":
+        return f"{who}'s silhouette fits none of the others"
+    if cause.kind == "contradictory":
+        return f"{who} contradicts the others"
+    return f"{who} {cause.kind}"
 
 
 def _instead(cause: Cause) -> str:

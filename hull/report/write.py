@@ -171,11 +171,22 @@ class ReportWriter:
         cameras = range(len(self._header.cameras))
         for part in self._part_columns(lambda key: key.startswith(("camera/", "frame/"))):
             each = [_outlines(part, number) for number in cameras]
-            deniers = np.array([part[_camera_key(number, "is_denier")] for number in cameras])
+            deniers, supported = (
+                np.array([part[_camera_key(number, name)] for number in cameras])
+                for name in ("is_denier", "supported_share")
+            )
             for row, index in enumerate(part[_frame_key("index")].tolist()):
-                is_read = part[_frame_key("state")][row] != "unread"
-                outlines = tuple(of_camera[row] for of_camera in each) if is_read else ()
-                frames.append(FrameOutlines(index, outlines, deniers[:, row]))
+                state = part[_frame_key("state")][row]
+                outlines = tuple(of_camera[row] for of_camera in each) if state != "unread" else ()
+                frames.append(
+                    FrameOutlines(
+                        index,
+                        outlines,
+                        deniers[:, row],
+                        supported[:, row],
+                        is_contradictory=state == "contradictory",
+                    )
+                )
         return frames
 
     def finish(self, agreement: SessionAgreement | None = None) -> None:
