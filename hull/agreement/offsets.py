@@ -29,6 +29,9 @@ LATEST = 12
 #: Blocks whose errors are taken to be independent, at most, and their least length in frames.
 _BLOCKS, LEAST_BLOCK = 24, 4
 
+#: Of two cameras' few ends of pencils: by this the variance is multiplied.
+_FEW_ENDS = 4.0
+
 #: So many limits must tell.
 LEAST_COUNT = 12
 
@@ -143,21 +146,32 @@ def _errors(
         be common to them.
     """
     n_frames = int(frames.max()) + 1 - int(frames.min())
-    length = max(LEAST_BLOCK, -(-n_frames // _BLOCKS))
+    length = max(min(LEAST_BLOCK, n_frames // 4), 1, -(-n_frames // _BLOCKS))
     n_unknown = len(inverse)
     meat = np.zeros((n_unknown, n_unknown))
-    groups = [(frames - frames.min()) // length]
+    n_blocks = _add_scores(meat, scores, (frames - frames.min()) // length)
+    if n_blocks <= n_unknown:
+        return np.full(n_unknown, np.inf)
+    covariance = inverse @ meat @ inverse * (n_blocks / (n_blocks - float(n_unknown)))
     if ends is not None:
-        groups.append(np.unique(ends, return_inverse=True)[1])
-    for group in groups:
-        n_groups = int(group.max()) + 1
-        if n_groups <= n_unknown:
-            return np.full(n_unknown, np.inf)
-        sums = np.zeros((n_groups, n_unknown))
-        np.add.at(sums, group, scores)
-        meat += sums.T @ sums * (n_groups / (n_groups - float(n_unknown)))
-    covariance = inverse @ meat @ inverse
+        common = np.zeros_like(meat)
+        n_ends = _add_scores(common, scores, np.unique(ends, return_inverse=True)[1])
+        if n_ends > n_unknown:
+            share = n_ends / (n_ends - float(n_unknown))
+            covariance += inverse @ common @ inverse * share
+        else:  # so few ends fit whatever errs at them: reckon with as much again, and more
+            covariance *= _FEW_ENDS
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def _add_scores(
+    meat: NDArray[np.float64], scores: NDArray[np.float64], groups: NDArray[np.int64]
+) -> int:
+    """Add the squares of the sums (P,) of scores of each group to (P, P); return how many."""
+    sums = np.zeros((int(groups.max()) + 1, len(meat)))
+    np.add.at(sums, groups, scores)
+    meat += sums.T @ sums
+    return len(sums)
 
 
 def _likeliest_delay(trial: Trial, camera: int) -> float:
