@@ -315,14 +315,15 @@ def replay(
                     doubts = doubter.frame(hull, chain.tracks.at(frame.index))
                 tally.look(frame.index, frame.time_s, hull, doubts)
             advance()
+    trust = judge_cameras(chain.session, chain.views, seen, chain.room, is_still=is_still)
     if not tally.n_valid:
+        why = f": {trust.distrust}" if trust.distrust else ""
         raise SessionError(
-            f"{chain.session.path}: none of the frames {chain.settings.frames} can be evaluated; "
-            "choose others with --frames"
+            f"{chain.session.path}: none of the frames {chain.settings.frames} can be evaluated"
+            f"{why}; choose others with --frames"
         )
     settings = resolved_settings(chain)
     about = {key: settings[key] for key in _KEPT}
-    trust = judge_cameras(chain.session, chain.views, seen, chain.room, is_still=is_still)
     return tally.answer(name, about | _about_errors(doubter), shifts_m, trust)
 
 

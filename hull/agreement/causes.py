@@ -73,7 +73,7 @@ GROSS_BUMP_PX, GROSS_LATE = 4.5, 1.5
 
 #: Without a delay or a bump, ends of pencils fit by at least this share of what it moves them
 #: better. So many ends must tell, and no more than this share of them fit worse, by so many pixels.
-_EXPECTED_SHARE, _LEAST_ENDS, _MOST_WORSE, _NO_WORSE_PX = 0.55, 4, 0.1, 1.0
+_EXPECTED_SHARE, _LEAST_ENDS, _MOST_WORSE, _NO_WORSE_PX = 0.55, 4, 0.2, 1.0
 
 #: A picture that was moved stays there: halves of the time differ by no more than this share of it.
 _WANDER = 0.35

@@ -84,6 +84,9 @@ _AS_GOOD = 0.1
 #: How far these rays are followed, in depths of the local origin.
 _REACH = 4.0
 
+#: A silhouette of less area than so many squares is cut into smaller ones.
+_FEW_SQUARES = 32
+
 #: Cells after which the search for what confirms a square of pixels is given up.
 _BLOCK_CELLS = 1000
 
@@ -460,7 +463,8 @@ def coherence(
         Those of the hull's views, where they were made already.
     sides_px : (C,) int64 or int, optional
         The squares' sides. By default four times the error and four pixels more, and so at least
-        twice as wide as what an outline's errors to both sides may put there.
+        twice as wide as what an outline's errors to both sides may put there; half of that, and so
+        still wider, in silhouettes that are too small for more than a few of those.
     """
     views = hull.views
     count = len(views)
@@ -469,7 +473,7 @@ def coherence(
         return Coherence(np.full(count, np.nan), np.full(count, np.nan))
     errors = np.broadcast_to(np.asarray(error_px, np.int64), (count,)).copy()
     if sides_px is None:
-        sides_px = np.maximum(4 * errors + 4, 8)
+        sides_px = _sides_px(hull, errors)
     sides = np.broadcast_to(np.asarray(sides_px, np.int64), (count,)).copy()
     blocks = find_blocks(
         make_pencils(views) if pencils is None else pencils,
@@ -506,6 +510,13 @@ def coherence(
         return Coherence(
             1.0 - n_unconfirmed / blocks.n_blocks, denied / others, tuple(found), deniers(found)
         )
+
+
+def _sides_px(hull: Hull, errors: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the sides (C,) of the squares that silhouettes are cut into."""
+    sides = np.maximum(4 * errors + 4, 8)
+    areas = hull.object_shares() * hull.views.sizes_px.prod(axis=1)
+    return np.where(areas < _FEW_SQUARES * sides**2, sides // 2, sides)
 
 
 def disputes(
