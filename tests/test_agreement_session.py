@@ -1,6 +1,7 @@
 """What the outlines of a whole session say: clocks, bumps, pictures exchanged or turned."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -104,6 +105,16 @@ def test_a_picture_that_is_turned_is_named(camera: int, kind: str, axes: tuple[i
     frames = spoilt(session_of(), camera, lambda mask, _: np.flip(mask, axes))
 
     assert kinds(frames) == [(kind, (f"cam{camera}",))]
+
+
+def test_pictures_of_another_size_are_named() -> None:
+    views = ring_views()
+    sizes_px = views.sizes_px.copy()
+    sizes_px[2] //= 2
+    frames = spoilt(session_of(), 2, lambda mask, _: mask[::2, ::2])
+
+    (cause,) = diagnose(trial_of(replace(views, sizes_px=sizes_px), frames)).causes
+    assert (cause.kind, cause.cameras) == ("scaled", ("cam2",))
 
 
 @pytest.mark.parametrize(("first", "second"), [(0, 1), (0, 2), (1, 3)])

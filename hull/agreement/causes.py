@@ -5,8 +5,9 @@ contradiction does not name the guilty one. Each cause is a change that would un
 the one after which outlines fit best is named, undone, and the rest looked at again. What is tried,
 and what is asked before it is named:
 
-* two cameras **exchanged**; a picture **mirrored**, **upside down** or **turned** by 180 degrees; a
-  mask **inverted**: outlines must fit by `_GROSS_GAIN_PX` better, and by a third;
+* two cameras **exchanged**; a picture **mirrored**, **upside down** or **turned** by 180 degrees,
+  or **scaled** from another camera's size; a mask **inverted**: outlines must fit by
+  `_GROSS_GAIN_PX` better, and by a third;
 * a picture **late** by up to `hybridve.hull.agreement.offsets.LATEST` frames, a picture **bumped**
   since the start or since some frame: the estimate must be beyond `_SIGNIFICANT` standard errors of
   what is tolerated (`_LEAST_LATE`, `_LEAST_BUMP_PX`);
@@ -16,10 +17,10 @@ A camera whose outlines fit none of the others for most of the session, whatever
 **contradictory**: something is wrong with it that is not in this list.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +36,14 @@ from hybridve.hull.agreement.offsets import (
     wander_of,
 )
 from hybridve.hull.agreement.trials import MOST_PX, Change, Misfit, Trial, misfit_by_frame
+from hybridve.hull.query.silhouettes import Views
 
 Kind = Literal[
     "exchanged",
     "mirrored",
     "upside down",
     "turned",
+    "scaled",
     "inverted",
     "late",
     "bumped",
@@ -57,6 +60,9 @@ _PICTURES: dict[Kind, tuple[float, float]] = {
 
 #: A gross cause must make outlines fit by so many pixels better, and leave so much at most.
 _GROSS_GAIN_PX, _GROSS_SHARE = 2.0, 0.67
+
+#: Pictures are changed in so many frames at most, evenly chosen, to find which change is best.
+_FRAMES_TRIED = 200
 
 #: Cameras that fit better than this, in pixels, are not tried for gross causes, unless more of the
 #: silhouettes than this share is not confirmed; a cause must confirm so much of them, and this
@@ -256,65 +262,78 @@ def _inverted(trial: Trial) -> tuple[list[Cause], Trial]:
 
 def _gross(trial: Trial, *, with_clock: bool) -> tuple[Cause | None, Trial]:
     """Return the gross cause without which outlines fit best, and the session without it."""
-    suspects = [
-        camera for camera in range(len(trial.views)) if trial.misfit([camera]).px >= _SUSPECT_PX
-    ]
-    share = unconfirmed_share(trial)
+    few = trial.some(_FRAMES_TRIED)
+    every = range(len(trial.views))
+    suspects = [camera for camera in every if few.misfit([camera]).px >= _SUSPECT_PX]
+    share = unconfirmed_share(few)
     if share >= _UNCONFIRMED:
-        suspects = list(range(len(trial.views)))
-    tried = list(_changes(trial, suspects))
-    fits: list[tuple[float, Cause | None, Trial]] = [
-        (undone.misfit().px, cause, undone) for cause, undone in tried if _is_gross_gain(cause)
-    ]
+        suspects = list(every)
+    least_px, best = np.inf, None
+    changes = list(_changes(trial.views, suspects))
+    fair = []
+    for change in changes:
+        undone = change.make(few)
+        before, after = few.misfit(change.cameras), undone.misfit(change.cameras)
+        if after.count < max(LEAST_COUNT, before.count // 2):
+            continue
+        if after.px < before.px + _NO_WORSE_PX:
+            fair.append(change)
+        is_gain = before.px - after.px >= _GROSS_GAIN_PX and after.px <= _GROSS_SHARE * before.px
+        if is_gain and undone.misfit().px < least_px:
+            least_px, best = undone.misfit().px, change
     # A delay that explains as much is told as such, with its size.
     for camera in suspects if with_clock else []:
         offset = offset_of(trial, camera)
         if offset.has_clock and abs(offset.late) > 1.0:
             later = trial.change(camera, -offset.moved_px, offset.late).adopted()
-            fits.append((later.misfit().px, None, trial))
-    if fits:
-        _, cause, undone = min(fits, key=lambda one: one[0])
-        return cause, undone
-    if share < _UNCONFIRMED:
+            if later.misfit().px < least_px:
+                return None, trial
+    if best is None and share >= _UNCONFIRMED and fair:
+        shares = [unconfirmed_share(change.make(few)) for change in fair]
+        if share - min(shares) >= max(_CONFIRMED_GAIN, _CONFIRMED_SHARE * share):
+            best = fair[int(np.argmin(shares))]
+    if best is None:
         return None, trial
-    shares = [
-        (unconfirmed_share(undone), cause, undone)
-        for cause, undone in tried
-        if cause.after_px < cause.before_px + _NO_WORSE_PX
-    ]
-    if not shares:
-        return None, trial
-    least, best, confirmed = min(shares, key=lambda one: one[0])
-    is_gain = share - least >= max(_CONFIRMED_GAIN, _CONFIRMED_SHARE * share)
-    return (best, confirmed) if is_gain else (None, trial)
+    undone = best.make(trial)
+    return Cause(
+        best.kind,
+        tuple(trial.views.names[camera] for camera in best.cameras),
+        0,
+        trial.table.n_frames - 1,
+        before_px=trial.misfit(best.cameras).px,
+        after_px=undone.misfit(best.cameras).px,
+    ), undone
 
 
-def _changes(trial: Trial, suspects: list[int]) -> Iterator[tuple[Cause, Trial]]:
-    """Yield every change of pictures that is tried, and what is then."""
-    names, last = trial.views.names, trial.table.n_frames - 1
-    sizes = trial.views.sizes_px.astype(np.float64)
+class _Pictures(NamedTuple):
+    """A change of the pictures of cameras, by number, that is tried."""
 
-    def told(kind: Kind, cameras: list[int], undone: Trial) -> tuple[Cause, Trial]:
-        before, after = trial.misfit(cameras), undone.misfit(cameras)
-        fit = after.px if after.count >= max(LEAST_COUNT, before.count // 2) else np.inf
-        who = tuple(names[camera] for camera in cameras)
-        return Cause(kind, who, 0, last, before_px=before.px, after_px=fit), undone
+    kind: Kind
+    cameras: list[int]
+    make: Callable[[Trial], Trial]
+
+
+def _changes(views: Views, suspects: Sequence[int]) -> Iterator[_Pictures]:
+    """Yield every change of pictures that is tried."""
+    sizes = views.sizes_px.astype(np.float64)
+
+    def mapped(kind: Kind, camera: int, factor: NDArray[np.float64]) -> _Pictures:
+        ends = np.where(factor < 0, sizes[camera], 0.0)
+        return _Pictures(kind, [camera], lambda trial: trial.mapped(camera, factor, ends))
 
     for camera in suspects:
         for kind, turned in _PICTURES.items():
-            sign = np.array(turned)
-            ends = np.where(sign < 0, sizes[camera], 0.0)
-            changed = trial.mapped(camera, sign, ends)
-            yield told(kind, [camera], changed)
+            yield mapped(kind, camera, np.array(turned))
+        # Where the rig tells no size, nobody else notices that pictures were made smaller.
+        for size in np.unique(sizes, axis=0):
+            if (size != sizes[camera]).any():
+                yield mapped("scaled", camera, size / sizes[camera])
     for first, second in combinations(suspects, 2):
-        yield told("exchanged", [first, second], trial.exchanged(first, second))
+        yield _exchange(first, second)
 
 
-def _is_gross_gain(cause: Cause) -> bool:
-    return (
-        cause.before_px - cause.after_px >= _GROSS_GAIN_PX
-        and cause.after_px <= _GROSS_SHARE * cause.before_px
-    )
+def _exchange(first: int, second: int) -> _Pictures:
+    return _Pictures("exchanged", [first, second], lambda trial: trial.exchanged(first, second))
 
 
 def _fine(

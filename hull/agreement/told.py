@@ -45,6 +45,12 @@ def message_of(
             f"{who}'s picture is {state}: {fits}so changed by {cause.after_px:.1f} px; {undo}, or "
             "calibrate again with pictures as they are recorded now"
         )
+    if cause.kind == "scaled":
+        return (
+            f"{who}'s pictures have another size than those that the rig was made for: {fits}"
+            f"scaled to another camera's size by {cause.after_px:.1f} px; take pictures of the "
+            "size that the camera was calibrated with"
+        )
     if cause.kind == "inverted":
         return (
             f"{who}'s masks show what is not there: inverted, its outlines miss those of the "

@@ -66,6 +66,19 @@ class Trial:
         pencils = make_pencils(views, _pairs(views))
         return cls(views, pencils, table, np.zeros(len(views)), limits_of(pencils, table))
 
+    def some(self, most: int) -> "Trial":
+        """Return the same of so many frames at most, evenly chosen: they tell no delay."""
+        n_frames = self.table.n_frames
+        if n_frames <= most:
+            return self
+        chosen = np.unique(np.linspace(0, n_frames - 1, most).astype(np.int64))
+        n_cameras = len(self.views)
+        rows = (chosen[:, None] * n_cameras + np.arange(n_cameras)).ravel()
+        angle, gradient, is_known = self.limits
+        limits = Limits(angle[:, chosen], gradient[:, chosen], is_known[:, chosen])
+        table = _rows_of(self.table, rows, self.table.is_inverse[chosen])
+        return replace(self, table=table, late=np.zeros(n_cameras), limits=limits)
+
     def rows(self, cameras: Sequence[int]) -> NDArray[np.int64]:
         """Return which pencils any of these cameras has a part in."""
         return np.flatnonzero(np.isin(self.pencils.cameras, cameras).any(axis=1))
@@ -263,18 +276,27 @@ def _exchanged(table: OutlineTable, views: Views, first: int, second: int) -> Ou
     order = np.arange(n_cameras)
     order[[first, second]] = second, first
     rows = (np.arange(n_frames)[:, None] * n_cameras + order).ravel()
+    exchanged = _rows_of(table, rows, table.is_inverse[:, order])
+    shift_px = (views.sizes_px - views.sizes_px[order]) / 2.0
+    for camera in (first, second):
+        exchanged.corners_px[_corners_of(exchanged, camera)] += shift_px[camera]
+    return exchanged
+
+
+def _rows_of(
+    table: OutlineTable, rows: NDArray[np.int64], is_inverse: NDArray[np.bool_]
+) -> OutlineTable:
+    """Return the outlines of some rows, in their order; `is_inverse` (F, C) is theirs."""
     n_pieces = np.diff(table.first_piece)[rows]
     pieces = _ranges(table.first_piece[rows], n_pieces)
     n_corners = np.diff(table.first_corner)[pieces]
     corners = _ranges(table.first_corner[pieces], n_corners)
-    shift_px = (views.sizes_px - views.sizes_px[order]) / 2.0
-    camera_of_piece = np.repeat(np.tile(np.arange(n_cameras), n_frames), n_pieces)
     return OutlineTable(
-        table.corners_px[corners] + shift_px[np.repeat(camera_of_piece, n_corners)],
+        table.corners_px[corners],
         table.is_cut[corners],
         np.concatenate([[0], np.cumsum(n_corners)]).astype(np.int64),
         np.concatenate([[0], np.cumsum(n_pieces)]).astype(np.int64),
-        np.ascontiguousarray(table.is_inverse[:, order]),
+        np.ascontiguousarray(is_inverse),
     )
 
 
