@@ -130,13 +130,24 @@ def print_summary(report: "Report") -> None:
 
 
 def _print_causes(causes: list[dict[str, Any]]) -> None:
-    """Print what is wrong with the cameras; of single frames that are, not more than some."""
-    alone = [cause for cause in causes if cause["kind"] == "frames"]
+    """Print what is wrong with the cameras; of many single frames of one, only which."""
+    alone: dict[str, list[dict[str, Any]]] = {}
     for cause in causes:
-        if cause["kind"] != "frames" or cause in alone[:_MOST_ENTRIES]:
+        if cause["kind"] == "frames":
+            alone.setdefault(cause["cameras"][0], []).append(cause)
+        else:
             click.echo(f"  {cause['message']}")
-    if len(alone) > _MOST_ENTRIES:
-        click.echo(f"  ... and {len(alone) - _MOST_ENTRIES} more such runs of frames (--json)")
+    for camera, runs in alone.items():
+        if len(runs) == 1:
+            click.echo(f"  {runs[0]['message']}")
+            continue
+        spans = [(run["first_frame"], run["last_frame"]) for run in runs]
+        shown = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in spans[:_MOST_NAMES])
+        more = ", ..." if len(spans) > _MOST_NAMES else ""
+        click.echo(
+            f"  {camera}'s silhouettes fit none of the others in {len(runs)} runs of frames "
+            f"({shown}{more}); look at them (`hybridve render --view cameras`)"
+        )
 
 
 def _overall_text(numbers: dict[str, Any]) -> str:

@@ -213,6 +213,7 @@ def _look(chain: Chain, tools: _Tools, frame: FrameHull, hull: Hull, watch: _Sto
             float(found.supported_share[camera]),
             float(found.denies_share[camera]),
             bool(kept.deniers[camera]),
+            kept.alone_px[camera],
             kept.outlines[camera],
         )
         for camera, (name, share) in enumerate(

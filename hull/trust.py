@@ -91,7 +91,8 @@ class Witness:
             outline_of(hull.mask(camera), inner) for camera, inner in enumerate(self.inners)
         )
         deniers = np.isin(names, found.deniers)
-        return found, FrameOutlines(index, outlines, deniers, found.supported_share)
+        alone_px = found.alone_px(names)
+        return found, FrameOutlines(index, outlines, deniers, found.supported_share, alone_px)
 
 
 def judge_cameras(

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridve.hull.agreement.causes import diagnose
+from hybridve.hull.agreement.causes import FrameVerdicts, diagnose
 from hybridve.hull.agreement.offsets import offset_of, step_of
 from hybridve.hull.agreement.outlines import (
     CUT,
@@ -321,7 +321,11 @@ def judged(frames: Sequence[Masks], first: int = 0, step: int = 1) -> SessionAgr
     nothing, nobody = np.full(4, np.nan), np.zeros(4, np.bool_)
     kept = [
         FrameOutlines(
-            first + step * row, tuple(outline_of(mask) for mask in masks), nobody, nothing
+            first + step * row,
+            tuple(outline_of(mask) for mask in masks),
+            nobody,
+            nothing,
+            np.full((4, 4), np.nan),
         )
         for row, masks in enumerate(frames)
     ]
@@ -354,6 +358,30 @@ def test_a_bump_that_is_small_is_trusted_and_reckoned_with() -> None:
     assert (excess_px[:, 3] > 2.0).all()
     assert (excess_px[:, 3] < 4.0).all()
     assert (excess_px[:, :3] < 0.5).all()
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 3), st.integers(0, 15), st.integers(0, 8))
+def test_what_one_camera_sees_all_the_time_was_left_behind(
+    camera: int, n_without: int, wander_px: int
+) -> None:
+    rng = np.random.default_rng(n_without)
+    alone_px = np.full((N_FRAMES, 4, 4), np.nan)
+    alone_px[:, camera] = (
+        np.array([10, 20, 60, 80]) + rng.integers(-2, 3, (N_FRAMES, 1)) * wander_px
+    )
+    alone_px[:n_without, camera] = np.nan
+    said = FrameVerdicts(
+        np.zeros((N_FRAMES, 4), np.bool_),
+        np.ones((N_FRAMES, 4)),
+        alone_px,
+        np.zeros(N_FRAMES, np.bool_),
+    )
+    causes = diagnose(trial_of(ring_views(), session_of()), said).causes
+
+    told = [(cause.kind, cause.cameras, cause.is_gross) for cause in causes]
+    expected = [("left behind", (f"cam{camera}",), False)] if n_without <= 3 else []
+    assert told == expected
 
 
 def test_frames_that_lie_apart_tell_no_clock() -> None:

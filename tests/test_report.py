@@ -160,6 +160,7 @@ def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
                 float(rng.uniform()),
                 float(rng.uniform()),
                 bool(rng.integers(2)),
+                rng.uniform(size=4),
                 an_outline(rng),
             )
             for _ in CAMERAS[: 0 if state == "unread" else None]
@@ -215,6 +216,9 @@ def test_what_is_written_is_read_back(tmp_path: Path, results: list[FrameResult]
                 getattr(one.cameras[number], name) if one.cameras else np.nan for one in results
             ]
             np.testing.assert_array_equal(read[name], shares)
+        nowhere = np.full(4, np.nan)
+        alone_px = [one.cameras[number].alone_px if one.cameras else nowhere for one in results]
+        np.testing.assert_array_equal(read["alone_px"], alone_px)
         deny = [bool(one.cameras) and one.cameras[number].is_denier for one in results]
         assert read["is_denier"].tolist() == deny
     assert list(report.objects) == ["object_0", "object_1"]

@@ -11,7 +11,9 @@ and what is asked before it is named:
 * a picture **late** by up to `hybridve.hull.agreement.offsets.LATEST` frames, a picture **bumped**
   since the start or since some frame: the estimate must be beyond `_SIGNIFICANT` standard errors of
   what is tolerated (`_LEAST_LATE`, `_LEAST_BUMP_PX`);
-* **frames** in which a camera's outlines fit none of the others, though they do in others.
+* **frames** in which a camera's outlines fit none of the others, though they do in others;
+* something **left behind** since the empty scene was taken: what one camera sees all the time, in
+  one place, and no other does.
 
 A camera whose outlines fit none of the others for most of the session, whatever is tried, is called
 **contradictory**: something is wrong with it that is not in this list.
@@ -48,6 +50,7 @@ Kind = Literal[
     "late",
     "bumped",
     "frames",
+    "left behind",
     "contradictory",
 ]
 
@@ -101,6 +104,10 @@ _FRAME_PX, _FRAME_SHARE, _OTHERS_PX = 4.0, 0.8, 1.5
 #: And by so many pixels worse in the middle one of them.
 _FRAME_MEDIAN_PX = 6.0
 
+#: Something was left behind that one camera sees in this share of the frames, in a place that
+#: moves by no more than so many pixels.
+_ALL_THE_TIME, _SAME_PLACE_PX = 0.9, 30.0
+
 #: A camera contradicts the session whose outlines fit the others no better than this, in pixels
 #: (15 is the most), if they support no more than this share of its silhouette; or that denies what
 #: they see in more than this share of the frames.
@@ -129,6 +136,8 @@ class Cause:
         How badly the cameras' outlines fit the others, as they are and with the cause undone.
     instead : tuple of str
         Cameras of which the same could be said as well.
+    box_px : (4,) float64
+        Of "left behind": left, top, right and bottom in the undistorted picture.
     """
 
     kind: Kind
@@ -142,6 +151,7 @@ class Cause:
     before_px: float = np.nan
     after_px: float = np.nan
     instead: tuple[str, ...] = ()
+    box_px: NDArray[np.float64] = field(default_factory=lambda: np.full(4, np.nan))
 
     @property
     def is_gross(self) -> bool:
@@ -150,7 +160,7 @@ class Cause:
             return abs(self.size) >= GROSS_LATE
         if self.kind == "bumped":
             return self.size >= GROSS_BUMP_PX
-        return self.kind != "frames"
+        return self.kind not in {"frames", "left behind"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,12 +195,15 @@ class FrameVerdicts:
         Whether each camera denies what several others see.
     supported_share : (F, C) float64
         How much of its silhouette the others support; NaN where nobody can tell.
+    alone_px : (F, C, 4) float64
+        Left, top, right and bottom of what each camera sees alone; NaN without.
     is_contradictory : (F,) bool
         Whether no point is in all silhouettes.
     """
 
     denies: NDArray[np.bool_]
     supported_share: NDArray[np.float64]
+    alone_px: NDArray[np.float64]
     is_contradictory: NDArray[np.bool_]
 
 
@@ -234,6 +247,7 @@ def diagnose(
                 undone[cause.cameras[0]][:2] += cause.moved_px
         offsets = [offset_of(trial, camera, far=False) for camera in range(len(names))]
     causes += _contradictory(trial, said, causes)
+    causes += _left_behind(trial, said, causes)
     causes += _frames(trial, None if said is None else said.denies, causes)
     offsets = [
         replace(
@@ -477,6 +491,24 @@ def _contradictory(
     is_gross = any(cause.is_gross for cause in [*causes, *found])
     if said is not None and not is_gross and said.is_contradictory.mean() > _MOST_FRAMES:
         found.append(Cause("contradictory", (), 0, last))
+    return found
+
+
+def _left_behind(trial: Trial, said: FrameVerdicts | None, causes: Sequence[Cause]) -> list[Cause]:
+    """Return the cameras that see something in one place all the time, and no other camera does."""
+    found: list[Cause] = []
+    if said is None or any(cause.is_gross for cause in causes):
+        return found
+    for camera, name in enumerate(trial.views.names):
+        boxes = said.alone_px[:, camera]
+        is_told = np.isfinite(boxes[:, 0])
+        if is_told.mean() < _ALL_THE_TIME:
+            continue
+        box = np.median(boxes[is_told], axis=0)
+        away_px = np.abs(boxes[is_told] - box).max(axis=1)
+        if (away_px <= _SAME_PLACE_PX).mean() >= _ALL_THE_TIME:
+            last = trial.table.n_frames - 1
+            found.append(Cause("left behind", (name,), 0, last, box_px=box))
     return found
 
 

@@ -429,6 +429,17 @@ class Coherence:
     disputes: tuple[Dispute, ...] = ()
     deniers: tuple[str, ...] = ()
 
+    def alone_px(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the box (C, 4) of what each camera sees and all others deny; NaN without.
+
+        Left, top, right and bottom in pixels.
+        """
+        boxes = np.full((len(names), 4), np.nan)
+        for one in self.disputes:
+            if not one.denied_by:
+                boxes[list(names).index(one.camera)] = one.box_px
+        return boxes
+
     @property
     def reason(self) -> str:
         """What is wrong with the frame, in words; empty where nobody denies what others see."""

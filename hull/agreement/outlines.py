@@ -112,6 +112,9 @@ class FrameOutlines:
         The cameras that deny what several others see.
     supported_share : (C,) float64
         How much of each silhouette the others support; NaN where nobody can tell.
+    alone_px : (C, 4) float64
+        Left, top, right and bottom of what each camera sees alone, that all others deny; NaN
+        where there is no such piece.
     is_contradictory : bool
         Whether no point is in all silhouettes, by more than they err.
     """
@@ -120,13 +123,15 @@ class FrameOutlines:
     outlines: tuple[Outline, ...]
     deniers: NDArray[np.bool_]
     supported_share: NDArray[np.float64]
+    alone_px: NDArray[np.float64]
     is_contradictory: bool = False
 
     @classmethod
     def unread(cls, index: int, n_cameras: int) -> Self:
         """Return what is kept of a frame that could not be read."""
         nothing = np.full(n_cameras, np.nan)
-        return cls(index, (), np.zeros(n_cameras, np.bool_), nothing)
+        nowhere = np.full((n_cameras, 4), np.nan)
+        return cls(index, (), np.zeros(n_cameras, np.bool_), nothing, nowhere)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

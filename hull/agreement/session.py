@@ -61,6 +61,7 @@ def judge_session(
     said = FrameVerdicts(
         np.array([frame.deniers for frame in frames]),
         np.array([frame.supported_share for frame in frames]),
+        np.array([frame.alone_px for frame in frames]),
         np.array([frame.is_contradictory for frame in frames]),
     )
     found = diagnose(Trial.of(views, table), said, with_clock=step <= _LARGEST_STEP)

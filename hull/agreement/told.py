@@ -85,6 +85,13 @@ def message_of(
             "(`hybridve render --view cameras`), or leave the camera out with "
             f"--drop-camera {who}"
         )
+    if cause.kind == "left behind":
+        left, top, right, bottom = (round(at) for at in cause.box_px.tolist())
+        return (
+            f"{who} sees something all the time that no other camera confirms, at ({left}, {top}) "
+            f"to ({right}, {bottom}) of its picture: it was left there, or moved, since the empty "
+            "scene was recorded, or it is a reflection; the hull is the same without it"
+        )
     whom = f"{who} contradicts the others" if who else "the silhouettes contradict each other"
     leave = f", or leave it out with --drop-camera {who}" if who else ""
     return (
@@ -101,6 +108,8 @@ def short_of(cause: Cause) -> str:
         return "the silhouettes contradict each other"
     if cause.kind == "frames":
         return f"{who}'s silhouette fits none of the others"
+    if cause.kind == "left behind":
+        return f"{who} sees something that was left behind"
     if cause.kind == "contradictory":
         return f"{who} contradicts the others"
     return f"{who} {cause.kind}"

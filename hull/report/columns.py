@@ -155,6 +155,16 @@ CAMERA_COLUMNS: tuple[Column[CameraFrame], ...] = (
         lambda camera: camera.is_denier,
     ),
     Column(
+        "alone_px",
+        "px",
+        "bound",
+        "left, top, right and bottom of what this camera sees and all others are proved to deny; "
+        "NaN where there is nothing",
+        np.float64,
+        lambda camera: camera.alone_px,
+        shape=(4,),
+    ),
+    Column(
         "outline/is_inverse",
         "1",
         "exact",

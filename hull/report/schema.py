@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.machine import Run
@@ -62,6 +63,8 @@ class CameraFrame:
         theirs, the share that it denies. See `hybridve.hull.agreement.frame.Coherence`.
     is_denier : bool
         Whether it denies pieces of two others' silhouettes at least.
+    alone_px : (4,) float64
+        Left, top, right and bottom of what it sees alone; NaN where there is nothing.
     outline : Outline
         Its outline.
     """
@@ -71,6 +74,7 @@ class CameraFrame:
     supported_share: float
     denies_share: float
     is_denier: bool
+    alone_px: NDArray[np.float64]
     outline: "Outline"
 
 

@@ -171,9 +171,9 @@ class ReportWriter:
         cameras = range(len(self._header.cameras))
         for part in self._part_columns(lambda key: key.startswith(("camera/", "frame/"))):
             each = [_outlines(part, number) for number in cameras]
-            deniers, supported = (
+            deniers, supported, alone_px = (
                 np.array([part[_camera_key(number, name)] for number in cameras])
-                for name in ("is_denier", "supported_share")
+                for name in ("is_denier", "supported_share", "alone_px")
             )
             for row, index in enumerate(part[_frame_key("index")].tolist()):
                 state = part[_frame_key("state")][row]
@@ -184,6 +184,7 @@ class ReportWriter:
                         outlines,
                         deniers[:, row],
                         supported[:, row],
+                        alone_px[:, row],
                         is_contradictory=state == "contradictory",
                     )
                 )
