@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.agreement.causes import diagnose
 from hybridve.hull.agreement.frame import coherence, judge_frame
+from hybridve.hull.agreement.others import meets_others
 from hybridve.hull.agreement.outlines import outline_of, table_of
 from hybridve.hull.agreement.sight import sight_of
 from hybridve.hull.agreement.trials import Trial
@@ -90,6 +91,7 @@ def _run_kernels() -> None:
     trio = make_hull(_views(3), [_mask()] * 3)
     judge_frame(trio)
     coherence(trio, 0)
+    meets_others(trio, 0)
     views = replace(trio.views, img_from_local=_apart(trio.views.img_from_local))
     diagnose(Trial.of(views, table_of([[outline_of(_mask())] * 3] * 12)))
     sight_of(trio.views, mesh.vertices_world, mesh.faces)

@@ -1,5 +1,10 @@
-"""One frame of a recording as pictures: the scene from outside, and what each camera saw."""
+"""One frame of a recording as pictures: the scene from outside, and what each camera saw.
 
+What a camera saw can be drawn with the CAD in it, or with what the others say that it saw.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,17 +12,25 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
 from hybridve.calib.rig import Rig
+from hybridve.hull.agreement.others import differences, in_view_of_others, meets_others
 from hybridve.hull.agreement.pieces import drop_unconfirmed
+from hybridve.hull.agreement.record import NamedCause
+from hybridve.hull.agreement.search import make_pencils
+from hybridve.hull.agreement.told import brief
 from hybridve.hull.capture.recording import (
     FrameRange,
+    as_recorded,
     recording_of,
     segmented_frames,
     undistort_mask,
 )
-from hybridve.hull.chain import Chain, views_at
+from hybridve.hull.capture.session import Session, SessionCamera
+from hybridve.hull.chain import Chain, make_doubter, views_at
 from hybridve.hull.contact.detect import Contact, detect_contacts
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.trust import Witness
+from hybridve.hull.view.contrast import contrast_sheet, draw_contrast
 from hybridve.hull.view.picture import (
     DrawnObject,
     contact_sheet,
@@ -26,6 +39,9 @@ from hybridve.hull.view.picture import (
 )
 
 Image = NDArray[np.uint8]
+
+#: Silhouettes of which there are no pictures are drawn in this grey, on black.
+_MASK_GREY = 90
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,20 +81,12 @@ def take_shot(chain: Chain, index: int, engine: Engine) -> Shot:
         If the recording does not have this frame, or a camera lacks it, or it is not known where
         one was.
     """
-    for frame in segmented_frames(chain.session, FrameRange(index, index + 1)):
-        reason = frame.reason or chain.tracks.missing(index)
-        if frame.masks is None or reason:
-            raise SessionError(f"{chain.session.path}: frame {index}: {reason}")
-        views = views_at(chain, index)
-        masks = drop_unconfirmed(views, chain.undistortions, frame.masks)
-        undistorted = [
-            undistort_mask(mask, lens)
-            for mask, lens in zip(masks, chain.undistortions, strict=True)
-        ]
-        hull = make_hull(views, undistorted)
-        rig = chain.rig.at(chain.tracks.at(index))
-        return Shot(chain, rig, index, masks, hull, detect_contacts(hull, chain.bodies, engine))
-    raise SessionError(f"{chain.session.path}: the recording has no frame {index}")
+    recorded = _silhouettes(chain, index)
+    views = views_at(chain, index)
+    masks = drop_unconfirmed(views, chain.undistortions, recorded)
+    hull = make_hull(views, _undistorted(chain, masks))
+    rig = chain.rig.at(chain.tracks.at(index))
+    return Shot(chain, rig, index, masks, hull, detect_contacts(hull, chain.bodies, engine))
 
 
 def draw_scene(shot: Shot, size_px: tuple[int, int]) -> Image:
@@ -88,14 +96,13 @@ def draw_scene(shot: Shot, size_px: tuple[int, int]) -> Image:
         for body, contact in zip(shot.chain.bodies, shot.contacts, strict=True)
         if contact.collides
     ]
-    time_s = shot.index / shot.chain.session.fps
     outcome = f"touched: {', '.join(touched)}" if touched else "nothing is touched"
     return draw_picture(
         shot.hull,
         shot.rig,
         _drawn_objects(shot),
         size_px=size_px,
-        title=f"{shot.chain.session.name}, frame {shot.index} ({time_s:.2f} s)",
+        title=_title(shot.chain, shot.index),
         caption=outcome,
     )
 
@@ -105,11 +112,105 @@ def draw_cameras(shot: Shot, columns: int = 2) -> Image:
     objects = _drawn_objects(shot)
     pictures = []
     for camera, mask in zip(shot.chain.session.cameras, shot.masks, strict=True):
-        recording = recording_of(shot.chain.session, camera)
-        number = shot.index - camera.shift_frames
-        for image in recording.frames(number, number + 1):
+        for image in _images(shot.chain.session, camera, shot.index):
             pictures.append(draw_overlay(image, shot.rig[camera.name], mask, objects))
     return contact_sheet(pictures, columns)
+
+
+def draw_agreement(chain: Chain, index: int, causes: Sequence[NamedCause] = ()) -> Image:
+    """Return what each camera saw, and what the others say that it saw.
+
+    Each camera's image as recorded, with its own silhouette and that of the hull of all others;
+    where they differ by more than outlines err, it is filled. Silhouettes are those that were cut
+    out, with pieces that no other camera confirms. Where silhouettes are given and no pictures,
+    they are grey on black. Parts of an image that the others cannot see are dark, and nothing is
+    filled there that the camera sees.
+
+    Parameters
+    ----------
+    chain : Chain
+        The recording; its settings say what is assumed of outlines.
+    index : int
+        Number of the frame.
+    causes : sequence of NamedCause
+        What is wrong with cameras; stands beside their names.
+
+    Raises
+    ------
+    SessionError
+        If the recording does not have this frame, or a camera lacks it, or it is not known where
+        one was, or there is only one camera.
+    """
+    session = chain.session
+    if len(session.cameras) < 2:
+        raise SessionError(f"{session.path}: a single camera has no others to agree with")
+    masks = _silhouettes(chain, index)
+    views = views_at(chain, index)
+    hull = make_hull(views, _undistorted(chain, masks))
+    pencils = make_pencils(views)
+    doubter = make_doubter(chain)
+    sigma_px = None if doubter is None else doubter.errors.sigma_px
+    error_px = Witness.of(views, chain.undistortions, sigma_px, is_still=False).error_px.tolist()
+    pictures, has_unseen = [], False
+    for number, (camera, lens) in enumerate(zip(session.cameras, chain.undistortions, strict=True)):
+        mask = masks[number] > 0
+        others, in_view = (
+            as_recorded(seen.astype(np.uint8), chain.rig[camera.name], lens) > 0
+            for seen in (
+                meets_others(hull, number, pencils),
+                in_view_of_others(views, number, pencils),
+            )
+        )
+        sees_alone, misses = differences(mask, others, error_px[number])
+        has_unseen |= not (camera.has_masks or in_view.all())
+        remarks = [brief(cause, camera.name) for cause in causes if camera.name in cause.cameras]
+        images = [np.repeat(mask[..., None] * np.uint8(_MASK_GREY), 3, axis=2)]
+        if not camera.has_masks:
+            images = list(_images(session, camera, index))
+        for image in images:
+            pictures.append(
+                draw_contrast(
+                    image,
+                    mask,
+                    others,
+                    (sees_alone & in_view, misses),
+                    in_view,
+                    name=camera.name,
+                    remark="; ".join(remarks),
+                )
+            )
+    columns = math.ceil(math.sqrt(len(pictures)))
+    return contrast_sheet(pictures, columns, _title(chain, index), has_unseen=has_unseen)
+
+
+def _silhouettes(chain: Chain, index: int) -> list[NDArray[np.uint8]]:
+    """Return a frame's silhouettes (H, W), as recorded.
+
+    Raises
+    ------
+    SessionError
+        As `take_shot` does.
+    """
+    for frame in segmented_frames(chain.session, FrameRange(index, index + 1)):
+        reason = frame.reason or chain.tracks.missing(index)
+        if frame.masks is None or reason:
+            raise SessionError(f"{chain.session.path}: frame {index}: {reason}")
+        return frame.masks
+    raise SessionError(f"{chain.session.path}: the recording has no frame {index}")
+
+
+def _undistorted(chain: Chain, masks: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    return [undistort_mask(*pair) for pair in zip(masks, chain.undistortions, strict=True)]
+
+
+def _images(session: Session, camera: SessionCamera, index: int) -> Iterator[Image]:
+    """Yield the image that a camera recorded at a frame, (H, W, 3)."""
+    number = index - camera.shift_frames
+    yield from recording_of(session, camera).frames(number, number + 1)
+
+
+def _title(chain: Chain, index: int) -> str:
+    return f"{chain.session.name}, frame {index} ({index / chain.session.fps:.2f} s)"
 
 
 def _drawn_objects(shot: Shot) -> list[DrawnObject]:

@@ -30,7 +30,7 @@ from hybridve.calib.pose import (
     transform,
 )
 from hybridve.calib.rig import Rig
-from hybridve.hull.capture.recording import undistort_mask
+from hybridve.hull.capture.recording import as_recorded, undistort_mask
 from hybridve.hull.chain import moved_views, rig_views
 from hybridve.hull.query.bounds import FREE, verdicts
 from hybridve.hull.query.reference import contains_points
@@ -258,6 +258,23 @@ def test_a_pixel_is_called_seen_just_where_the_recording_fills_it(model: str) ->
     else:
         np.testing.assert_array_equal(lens.seen, filled == 255)
         assert not lens.seen.all()
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_a_mask_comes_back_from_the_pinhole_image_as_it_was_recorded(model: str) -> None:
+    camera = make_camera("cam", model, POSE)
+    lens = undistortion(camera)
+    rows, columns = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
+    # Where the border of a pinhole image cuts off what a fisheye saw, it does not come back.
+    near = np.hypot(columns - WIDTH_PX / 2, rows - HEIGHT_PX / 2) < 0.45 * HEIGHT_PX
+    squares = ((columns // 40 + rows // 40) % 2 == 0) & near
+
+    again = as_recorded(undistort_mask(squares.astype(np.uint8), lens), camera, lens) > 0
+
+    at_edge = np.zeros_like(squares)
+    for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):
+        at_edge |= squares != np.roll(squares, (down, right), (0, 1))
+    np.testing.assert_array_equal(again[~at_edge], squares[~at_edge])
 
 
 @pytest.mark.parametrize("model", sorted(LENSES))

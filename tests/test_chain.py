@@ -112,6 +112,23 @@ def test_every_true_collision_is_found_and_what_is_far_is_free(folder: Path) -> 
 
 
 @pytest.mark.slow
+def test_no_camera_sees_what_the_others_do_not(run: Run, folder: Path) -> None:
+    session, path = folder / "session", folder / "agreement.png"
+    arguments = ("--scene", session / "scene.toml", "--report", folder / "report.h5", "-o", path)
+
+    assert run("render", session, *arguments, "--view", "agreement") == 0
+
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    blue, green, red = picture[60:-60].astype(int).transpose(2, 0, 1)  # without the legend
+    is_outline = (green > 200) & (red < 60) & (blue > 150)
+    is_filled = (green > 130) & (green < 200) & (red < 90) & (blue > 110) & (blue < 170)
+    assert is_outline.sum() > 500
+    # Where outlines are drawn colours mix, but not over 4 by 4 pixels.
+    assert not cv2.erode(is_filled.astype(np.uint8), np.ones((4, 4), np.uint8)).any()
+
+
+@pytest.mark.slow
 def test_the_pictures_show_the_collision_in_red(run: Run, folder: Path) -> None:
     session, report = folder / "session", folder / "report.h5"
     arguments = [session, "--scene", session / "scene.toml", "--report", report]

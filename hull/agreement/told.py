@@ -1,6 +1,7 @@
 """What is wrong with a session, in one line each: what was found, what was expected, what to do."""
 
 from hybridve.hull.agreement.causes import Cause
+from hybridve.hull.agreement.record import NamedCause
 
 
 def message_of(
@@ -113,6 +114,27 @@ def short_of(cause: Cause) -> str:
     if cause.kind == "contradictory":
         return f"{who} contradicts the others"
     return f"{who} {cause.kind}"
+
+
+def brief(cause: NamedCause, camera: str) -> str:
+    """Return a cause, as a report has it, in the few words that go into a picture of a camera.
+
+    `camera` is the name of one of the cause's cameras.
+    """
+    if cause.kind == "exchanged":
+        return f"exchanged with {' and '.join(name for name in cause.cameras if name != camera)}"
+    if cause.kind == "late" and cause.size is not None:
+        return f"{abs(cause.size):.2f} frames {'late' if cause.size > 0 else 'early'}"
+    if cause.kind in ("bumped", "moved") and cause.size is not None:
+        return f"{cause.kind} by {cause.size:.1f} px"
+    if cause.kind == "frames":
+        by = "" if cause.size is None else f" by {cause.size:.1f} px"
+        if cause.first_frame == cause.last_frame:
+            return f"fits none of the others{by} in frame {cause.first_frame}"
+        return f"fits none of the others{by} in frames {cause.first_frame} to {cause.last_frame}"
+    if cause.kind == "contradictory":
+        return "contradicts the others"
+    return cause.kind
 
 
 def _instead(cause: Cause) -> str:

@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.camera import Camera
 from hybridve.calib.errors import SessionError
 from hybridve.calib.image_io import FrameSource, Image
-from hybridve.calib.lens import Undistortion
+from hybridve.calib.lens import Undistortion, cam_from_img
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import METHOD_VERSION, Segmenter, threshold_mask
 from hybridve.hull.capture.session import Session, SessionCamera
@@ -33,6 +34,9 @@ Mask = NDArray[np.uint8]
 
 #: How many frames a camera is read ahead: enough to smooth out a slow frame.
 _READ_AHEAD = 3
+
+#: How far apart, in recorded pixels, a lens is asked where a mask is bent as it bends.
+_LENS_STEP_PX = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,6 +331,29 @@ def undistort_mask(mask: Mask, undistortion: Undistortion) -> Mask:
             borderValue=0,
         ),
         np.uint8,
+    )
+
+
+def as_recorded(mask: Mask, camera: Camera, undistortion: Undistortion) -> Mask:
+    """Return a mask of the pinhole image, (h, w), as the lens bends it into the recorded, (H, W).
+
+    0 where the pinhole image has nothing. The lens is asked every 8 pixels and taken to be even
+    between.
+    """
+    if undistortion.map_x is None:
+        return mask
+    size = (camera.height_px, camera.width_px)
+    nodes = [np.arange(0.0, extent + 2 * _LENS_STEP_PX, _LENS_STEP_PX) for extent in size]
+    grid = np.stack(np.meshgrid(*nodes[::-1]), axis=-1)
+    rays = cam_from_img(camera, grid.reshape(-1, 2))
+    places = rays @ undistortion.img_from_cam[:2, :2].T + undistortion.img_from_cam[:2, 2]
+    # OpenCV's pixel centres are at 0, both of what is looked up and of the grid.
+    coarse = (places - 0.5).reshape(grid.shape).astype(np.float32)
+    at_y, at_x = ((np.arange(extent, dtype=np.float32) + 0.5) / _LENS_STEP_PX for extent in size)
+    fine = cv2.remap(coarse, *np.meshgrid(at_x, at_y), cv2.INTER_LINEAR)
+    fine = np.where(np.isfinite(fine), fine, np.float32(-2.0))
+    return np.asarray(
+        cv2.remap(mask, fine[..., 0], fine[..., 1], cv2.INTER_NEAREST, borderValue=0), np.uint8
     )
 
 

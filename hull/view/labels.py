@@ -150,16 +150,26 @@ def _overlap(first: Box, second: Box) -> bool:
     )
 
 
+def legend_width(entries: list[tuple[str, Rgb, str]], scale: float) -> int:
+    """Return how wide a line of entries is, in pixels, without what is around it."""
+    beside = round(18 * scale) + round(8 * scale)
+    widths = [beside + text_size(text, LABEL_SIZE * scale)[0] for _, _, text in entries]
+    return sum(widths) + round(26 * scale) * (len(entries) - 1)
+
+
 def draw_legend(
     image: Image, entries: list[tuple[str, Rgb, str]], left: int, baseline: int, scale: float
 ) -> Box:
-    """Write a line of entries (kind, colour, text), kind "patch" or "dot"; return its rectangle."""
+    """Write a line of entries (kind, colour, text); return its rectangle.
+
+    Kinds are "patch", "dot" and "line".
+    """
     size = LABEL_SIZE * scale
     patch, gap = round(18 * scale), round(26 * scale)
     above = text_size("Ag", size)[1]
     pad = round(12 * scale)
     widths = [patch + round(8 * scale) + text_size(text, size)[0] for _, _, text in entries]
-    right = left + sum(widths) + gap * (len(entries) - 1)
+    right = left + legend_width(entries, scale)
     box = (left - pad, baseline - above - pad, right + pad, baseline + pad)
     plate(image, box, 0.8)
     x = left
@@ -168,6 +178,10 @@ def draw_legend(
         if kind == "dot":
             center = (x + patch // 2, middle)
             cv2.circle(image, center, max(2, round(4 * scale)), bgr(rgb), -1, cv2.LINE_AA)
+        elif kind == "line":
+            ends = (x, middle), (x + patch, middle)
+            cv2.line(image, *ends, (0, 0, 0), max(3, round(5 * scale)), cv2.LINE_AA)
+            cv2.line(image, *ends, bgr(rgb), max(1, round(3 * scale)), cv2.LINE_AA)
         else:
             corners = (x, middle - patch // 2), (x + patch, middle + patch // 2)
             cv2.rectangle(image, *corners, bgr(rgb), -1)
