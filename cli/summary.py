@@ -146,7 +146,7 @@ def _print_causes(causes: list[dict[str, Any]]) -> None:
         more = ", ..." if len(spans) > _MOST_NAMES else ""
         click.echo(
             f"  {camera}'s silhouettes fit none of the others in {len(runs)} runs of frames "
-            f"({shown}{more}); look at them (`hybridve render --view cameras`)"
+            f"({shown}{more}); look at them (`hybridve render --view agreement`)"
         )
 
 

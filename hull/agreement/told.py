@@ -83,7 +83,7 @@ def message_of(
         by = f", by {cause.size:.1f} px more than usual" if cause.size == cause.size else ""
         return (
             f"{who}'s silhouettes of {when} fit none of the others{by}; look at them "
-            "(`hybridve render --view cameras`), or leave the camera out with "
+            "(`hybridve render --view agreement`), or leave the camera out with "
             f"--drop-camera {who}"
         )
     if cause.kind == "left behind":
@@ -98,7 +98,7 @@ def message_of(
     return (
         f"{whom} most of the time (frames {start} to {end}), and nothing that was tried explains "
         "it (exchanged, mirrored, turned, inverted, late, bumped); look at the silhouettes "
-        f"(`hybridve render --view cameras`), at backgrounds and poses{leave}"
+        f"(`hybridve render --view agreement`), at backgrounds and poses{leave}"
     )
 
 
