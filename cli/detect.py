@@ -202,7 +202,7 @@ def _cell_text(cell: dict[str, Any] | None) -> str:
     """Return a verdict in a few words: with the clearance, or how deep and how often."""
     if cell is None:
         return "no report"
-    parts = [cell["verdict"]]
+    parts = [cell["verdict"] if cell["trusted"] else f"not to be trusted ({cell['verdict']})"]
     if clashing := cell["frames_colliding"] + cell["frames_inside"]:
         parts.append(f"{clashing} of {cell['frames']} frames")
         if cell["depth_upper_m"] is not None:

@@ -77,14 +77,16 @@ def a_summary(verdict: str, lower_m: float | None, name: str = "payload") -> dic
         "frames_inside": 0,
         "frames_below_required": 4,
     }
-    return {"report": "r.h5", "frames": 10, "frames_invalid": 1, "objects": [found]}
+    trusted = verdict != "unknown"
+    about = {"report": "r.h5", "trusted": trusted, "frames": 10, "frames_invalid": 1}
+    return {**about, "objects": [found]}
 
 
 PAIRS = [
     Pair("p1", "narrow", a_summary("colliding", 0.0)),
     Pair("p1", "wide", a_summary("free", 0.0124)),
     Pair("p2", "narrow", None, "no rig"),
-    Pair("p2", "wide", a_summary("clear", None)),
+    Pair("p2", "wide", a_summary("unknown", None)),
 ]
 
 
@@ -113,6 +115,7 @@ def test_the_table_has_units_and_kinds_and_leaves_unknown_cells_empty(tmp_path: 
     assert (near["p1"], near["p2"]) == ("12.4000", "")
     assert rows["wide", "frames_below_required"]["p2"] == "4"
     assert rows["narrow", "verdict"]["p1"] == "colliding"
+    assert (rows["wide", "trusted"]["p1"], rows["wide", "trusted"]["p2"]) == ("yes", "no")
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -99,6 +99,7 @@ class _Quantity:
 #: What the table has of each object, each session and each layout. Kinds are those of a report.
 _QUANTITIES = (
     _Quantity("verdict", "", "exact"),
+    _Quantity("trusted", "", "estimate"),
     _Quantity("clearance_lower", "mm", "bound"),
     _Quantity("clearance_upper", "mm", "bound"),
     _Quantity("clearance_at_least_95", "mm", "estimate"),
@@ -152,6 +153,7 @@ def _cell(summary: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
     return {
         "report": summary["report"],
         "verdict": found["verdict"],
+        "trusted": summary["trusted"],
         "clearance_lower_m": clearance.get("lower_m"),
         "clearance_upper_m": clearance.get("upper_m"),
         "clearance_at_least_95_m": clearance.get("at_least_95_m"),
@@ -199,4 +201,6 @@ def _csv_value(cell: dict[str, Any] | None, quantity: _Quantity) -> Any:
     else:
         metres = cell[f"{quantity.key}_m"]
         value = None if metres is None else f"{1e3 * metres:.4f}"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return "" if value is None else value
