@@ -13,6 +13,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from helpers.exact_geometry import squared_to_triangle
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.viewport import sample_steps
@@ -301,31 +302,6 @@ def clipped(
     return polygon, is_well_in
 
 
-def squared_distance(point: list[Fraction], corners: list[list[Fraction]]) -> Fraction:
-    """Return the squared distance of a point and a triangle, whatever its shape.
-
-    The nearest point lies on an edge, or over the inside of a triangle that has area.
-    """
-    best = None
-    for k in range(3):
-        start, way = corners[k], _less(corners[(k + 1) % 3], corners[k])
-        length, to = _dot(way, way), _less(point, start)
-        share = min(max(_dot(to, way) / length, Fraction(0)), Fraction(1)) if length else 0
-        apart = [a - share * b for a, b in zip(to, way, strict=True)]
-        squared = _dot(apart, apart)
-        best = squared if best is None or squared < best else best
-    ab, ac = _less(corners[1], corners[0]), _less(corners[2], corners[0])
-    normal, to = _cross(ab, ac), _less(point, corners[0])
-    length = _dot(normal, normal)
-    assert best is not None
-    if length == 0:
-        return best
-    t, s = _dot(_cross(ab, to), normal), _dot(_cross(to, ac), normal)
-    if s >= 0 and t >= 0 and s + t <= length:
-        return _dot(to, normal) ** 2 / length
-    return best
-
-
 def distance(
     point: NDArray[np.float64], vertices: NDArray[np.float64], faces: NDArray[np.int32]
 ) -> float:
@@ -333,14 +309,11 @@ def distance(
     corners = vertices[faces]
     beyond = np.maximum(np.maximum(corners.min(axis=1) - point, point - corners.max(axis=1)), 0)
     at_least = np.linalg.norm(beyond, axis=1)
-    exactly = [Fraction(float(x)) for x in point]
     best = None
     for number in np.argsort(at_least, kind="stable"):
         if best is not None and at_least[number] ** 2 > float(best) * (1 + 1e-9):
             break
-        squared = squared_distance(
-            exactly, [[Fraction(float(x)) for x in corner] for corner in corners[number]]
-        )
+        squared = squared_to_triangle(point, corners[number])
         best = squared if best is None or squared < best else best
     return 0.0 if not best else _root(best)
 
@@ -349,19 +322,3 @@ def _root(squared: Fraction) -> float:
     """Return a square root; of numbers that float64 does not hold, too."""
     shift = (squared.denominator.bit_length() - squared.numerator.bit_length()) // 2
     return float(np.ldexp(float(squared * Fraction(4) ** shift) ** 0.5, -shift))
-
-
-def _less(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-    return [x - y for x, y in zip(a, b, strict=True)]
-
-
-def _dot(a: list[Fraction], b: list[Fraction]) -> Fraction:
-    return sum((x * y for x, y in zip(a, b, strict=True)), Fraction(0))
-
-
-def _cross(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
