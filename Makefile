@@ -23,6 +23,7 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml -p hybridve
+	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml ../../tests
 	$(BIN)/lint-imports
 
 # Files of tests side by side; one file stays with one process, so that fixtures are made once.

@@ -36,7 +36,7 @@ settings.load_profile("same")
 # Hypothesis draws some numbers from the sources of whatever modules this process has loaded so far.
 # Which those are depends on the tests that came before, and with several processes on their speed;
 # so no source is read.
-providers.is_local_module_file = lambda path: False  # type: ignore[assignment]
+providers.is_local_module_file = lambda path: False  # type: ignore[attr-defined,assignment]
 
 # Compiled code is the user's own: it takes long, and is named after its sources. numba looks where
 # to keep it when it is loaded, before there is any fixture.

@@ -277,7 +277,8 @@ def test_outlines_within_their_errors_never_contradict(
             masks[camera] = shifted(mask, by_px, int(rng.integers(-error_px, error_px + 1)))
         else:
             kernel = np.ones((2 * abs(by_px) + 1,) * 2, np.uint8)
-            masks[camera] = (cv2.dilate if by_px > 0 else cv2.erode)(mask, kernel)
+            changed = (cv2.dilate if by_px > 0 else cv2.erode)(mask, kernel)
+            masks[camera] = np.asarray(changed, np.uint8)
     hull = make_hull(views, masks)
 
     # A pixel more: silhouettes are of pixels' centres.
@@ -315,7 +316,8 @@ def test_whatever_is_told_holds(seed: int, n_cameras: int, keep: bool) -> None:
     assert set(told.silent) == {
         name for name, mask in zip(views.names, masks, strict=True) if not mask.any()
     }
-    grown = [cv2.dilate(mask, np.ones((7, 7), np.uint8)) for mask in masks]
+    kernel = np.ones((7, 7), np.uint8)
+    grown = [np.asarray(cv2.dilate(mask, kernel), np.uint8) for mask in masks]
     if told.kind == "contradiction":
         assert not contains_points(make_hull(views, grown), points).any()
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
 from hybridve.hull.cad import mesh as mesh_module
+from hybridve.hull.cad import readers
 from hybridve.hull.cad import readers as readers_module
 from hybridve.hull.cad.mesh import CadFile, read_cad
 from hybridve.hull.cad.mesh_cache import find_meshes, keep_meshes, mesh_key
@@ -119,7 +120,8 @@ def assert_same(first: CadFile, again: CadFile) -> None:
     for part, other in zip(first.parts, again.parts, strict=True):
         assert part.vertices.tobytes() == other.vertices.tobytes()
         assert part.faces.tobytes() == other.faces.tobytes()
-        assert (other.vertices.dtype, other.faces.dtype) == (np.float64, np.int32)
+        assert other.vertices.dtype == np.float64
+        assert other.faces.dtype == np.int32
         assert (part.name, part.material, part.rgba) == (other.name, other.material, other.rgba)
         assert (part.cuts, part.off_by_m) == (other.cuts, other.off_by_m)
 
@@ -332,7 +334,7 @@ def test_materials_leave_the_triangles_in_their_order(folder: Path, tmp_path: Pa
 def test_what_is_kept_is_what_was_read_though_the_file_changes_meanwhile(
     folder: Path, cube: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parse = mesh_module.parse
+    parse = readers.parse
 
     def write_then_parse(*arguments: Any) -> Contents:
         cube.write_text(CUBE.replace("v 100 100 100", "v 100 100 107"), encoding="utf-8")
@@ -370,7 +372,8 @@ def test_a_second_detect_does_without_the_readers(folder: Path, tmp_path: Path) 
     )
     without = "from hybridve.hull.cad import mesh\nmesh.parse = None\n"
 
-    arguments = ["detect", session, "--scene", scene, "-o", tmp_path / "report.h5", "--overwrite"]
+    report = tmp_path / "report.h5"
+    arguments: list[str | Path] = ["detect", session, "--scene", scene, "-o", report, "--overwrite"]
 
     shown = [
         subprocess.run(

@@ -1,5 +1,7 @@
 """Polygons become triangles: their area, once, wholly; or they are refused."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -21,7 +23,7 @@ STAR = [(0, 3), (-1, 1), (-3, 0), (-1, -1), (0, -3), (1, -1), (3, 0), (1, 1)]
 KEYHOLE = [(0, 0), (6, 0), (6, 6), (0, 6), (0, 0), (2, 2), (2, 4), (4, 4), (4, 2), (2, 2)]
 
 
-def raised(points: list[tuple[float, float]]) -> NDArray[np.float64]:
+def raised(points: Sequence[tuple[float, float]]) -> NDArray[np.float64]:
     return np.column_stack([np.array(points, np.float64), np.zeros(len(points))])
 
 

@@ -10,12 +10,11 @@ from helpers.bundles import back_to_back, make_bundle, perturbed
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.pose import angle_between, compose
+from hybridve.calib.pose import angle_between, compose, moved_pose
 from hybridve.calib.solving.bundle import (
     Bundle,
     adjust,
     lens_derivatives,
-    moved_pose,
     view_residuals,
 )
 

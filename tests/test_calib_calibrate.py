@@ -5,6 +5,7 @@ import json
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from helpers.boards import (
     render_board,
     ring,
 )
+from helpers.records import record_of
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Observations, Sighting
@@ -80,7 +82,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def inputs(root: Path, **changes: object) -> list[CameraInput]:
+def inputs(root: Path, **changes: Any) -> list[CameraInput]:
     return [
         replace(
             CameraInput(
@@ -159,7 +161,7 @@ def test_corners_marked_by_hand_serve_where_none_are_found(
 
     rig = calibrate_rig([BOARD], [left], SETTINGS).rig
 
-    assert "marked by hand" in rig.provenance.cameras["left"].extrinsics.how
+    assert "marked by hand" in record_of(rig).cameras["left"].extrinsics.how
     assert any("no board found" in record.message for record in caplog.records)
     distance_m = np.linalg.norm(rig["left"].center_world - camera.center_world)
     assert distance_m < 3 * PLACED * np.linalg.norm(camera.center_world)
@@ -222,9 +224,12 @@ def test_the_floor_around_it_tells_which_way_round_a_board_was_seen(board: Chess
     rig = solve_rig([board], observations).rig
 
     np.testing.assert_allclose(distances(rig.cameras), distances(cameras), rtol=PLACED)
-    evidence = rig.provenance.labelling
+    evidence = record_of(rig).labelling
+    assert evidence is not None
     assert not evidence.is_weak
+    assert evidence.weakest_sigma is not None
     assert evidence.weakest_sigma > 5.0
+    assert evidence.matches_by_look is not None
     assert len(evidence.matches_by_look["cam1 cam2"]) == len(board.looks)
 
 
@@ -236,7 +241,9 @@ def test_without_anything_around_it_the_doubt_is_said(caplog: pytest.LogCaptureF
     with caplog.at_level(logging.WARNING):
         rig = solve_rig([SYMMETRIC], observations).rig
 
-    assert rig.provenance.labelling.is_weak
+    evidence = record_of(rig).labelling
+    assert evidence is not None
+    assert evidence.is_weak
     assert any("uncertain" in record.message for record in caplog.records)
 
 

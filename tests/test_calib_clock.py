@@ -173,7 +173,7 @@ def test_the_views_that_jump_are_told() -> None:
 def test_a_board_that_is_shaken_is_no_view_that_jumps() -> None:
     # To and fro within 12 frames, and still before and after: slow frames tell nothing of fast.
     def shaken(time: float) -> float:
-        return 10.0 * np.sin(time / 2.0) * np.exp(-(((time - 30.0) / 8.0) ** 2))
+        return float(10.0 * np.sin(time / 2.0) * np.exp(-(((time - 30.0) / 8.0) ** 2)))
 
     def swung(late: float) -> tuple[Sighting, ...]:
         corners = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0)), axis=2).reshape(-1, 2)

@@ -1,5 +1,6 @@
 """Answers about pictures kept beside a session: the same to the bit, or as if there were none."""
 
+import hashlib
 import os
 import shutil
 import time
@@ -7,12 +8,15 @@ import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hybridve.calib.cache import cache_key
 from hybridve.calib.seeing import corner_cache
 from hybridve.calib.seeing.corner_cache import Answer, CornerCache
 
@@ -59,7 +63,7 @@ def test_another_opencv_asks_again(folder: Path, monkeypatch: pytest.MonkeyPatch
     cache = CornerCache(folder)
     cache.keep(("which",), ANSWER)
 
-    monkeypatch.setattr(corner_cache.cv2, "__version__", "99.0")
+    monkeypatch.setattr(cv2, "__version__", "99.0")
 
     assert cache.known(("which",)) is None
 
@@ -104,7 +108,7 @@ def test_pictures_used_least_lately_go(folder: Path, monkeypatch: pytest.MonkeyP
     cache = CornerCache(folder)
 
     def is_kept(number: int) -> bool:
-        path = folder / f"{corner_cache.cache_key(corner_cache.cv2.__version__, number)}.zip"
+        path = folder / f"{cache_key(cv2.__version__, number)}.zip"
         return path.exists()
 
     for number in range(2):
@@ -228,14 +232,14 @@ def write(path: Path, content: bytes, age_s: float = 60.0) -> Path:
 def reads(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     """Return how many files were read so far."""
     count = 0
-    digest = corner_cache.hashlib.file_digest
+    digest = hashlib.file_digest
 
-    def counted(*arguments: object) -> object:
+    def counted(*arguments: Any) -> object:
         nonlocal count
         count += 1
-        return digest(*arguments)  # type: ignore[arg-type]
+        return digest(*arguments)
 
-    monkeypatch.setattr(corner_cache.hashlib, "file_digest", counted)
+    monkeypatch.setattr(hashlib, "file_digest", counted)
     return lambda: count
 
 
@@ -259,7 +263,7 @@ def test_a_file_that_did_not_change_is_not_read_again(
 ) -> None:
     path = write(tmp_path / "a", b"123")
     now_ns = time.time_ns()
-    monkeypatch.setattr(corner_cache.time, "time_ns", lambda: now_ns + 60_000_000_000)
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns + 60_000_000_000)
     cache = CornerCache(folder)
     first = cache.identify([path])
     cache.save()
@@ -274,9 +278,7 @@ def test_a_file_just_written_is_read_again_whatever_its_times_say(
 ) -> None:
     path = write(tmp_path / "a", b"123", age_s=0.0)
     found = path.stat()
-    monkeypatch.setattr(
-        corner_cache.time, "time_ns", lambda: max(found.st_mtime_ns, found.st_ctime_ns) + 1
-    )
+    monkeypatch.setattr(time, "time_ns", lambda: max(found.st_mtime_ns, found.st_ctime_ns) + 1)
     cache = CornerCache(folder)
 
     cache.identify([path])
@@ -291,7 +293,7 @@ def test_another_content_with_the_size_and_the_time_of_the_first_is_noticed(
     path = write(tmp_path / "a", b"123")
     before = path.stat()
     now_ns = time.time_ns()
-    monkeypatch.setattr(corner_cache.time, "time_ns", lambda: now_ns + 60_000_000_000)
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns + 60_000_000_000)
     cache = CornerCache(folder)
     first = cache.identify([path])
     time.sleep(0.02)  # more than a tick of any file system's clock that counts finely

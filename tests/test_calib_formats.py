@@ -15,6 +15,7 @@ from hybridve.calib.formats.rig_export import export_rig
 from hybridve.calib.formats.rigs import import_rig, read_any_rig
 from hybridve.calib.lens import img_from_cam, project_points
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes
+from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 
 EXACT_PX = 1e-9
@@ -30,7 +31,8 @@ ROTATION = rotation_about_axes((100.0, -20.0, 5.0))
 def rig_of(*models: str) -> Rig:
     poses = [look_at((2.0, 0.7 * k, 1.0), (0, 0, 0), 5.0 * k) for k in range(len(models))]
     return Rig(
-        tuple(make_camera(f"cam{k + 1}", m, poses[k]) for k, m in enumerate(models)), {"made": "up"}
+        tuple(make_camera(f"cam{k + 1}", m, poses[k]) for k, m in enumerate(models)),
+        MadeElsewhere({"made": "up"}),
     )
 
 
@@ -48,7 +50,7 @@ def opencv_pixels(
         found, _ = cv2.fisheye.projectPoints(points[:, None], rvec, pose[:, 3], matrix, distortion)
     else:
         found, _ = cv2.projectPoints(points, rvec, pose[:, 3], matrix, distortion)
-    return np.asarray(found)[:, 0] + 0.5
+    return np.asarray(found, np.float64)[:, 0] + 0.5
 
 
 def assert_images(camera: Camera, expected: NDArray[np.float64]) -> None:
@@ -314,7 +316,9 @@ def test_opencv_sees_with_what_is_written_what_we_see(
     for camera, path in zip(rig.cameras, written.files, strict=True):
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         nodes = ("camera_matrix", "distortion_coefficients", "R", "tvec")
-        matrix, distortion, rotation, tvec = (storage.getNode(name).mat() for name in nodes)
+        matrix, distortion, rotation, tvec = (
+            np.asarray(storage.getNode(name).mat(), np.float64) for name in nodes
+        )
         is_fisheye = storage.getNode("distortion_model").string() == "equidistant"
         storage.release()
         pose = np.column_stack([rotation, tvec / 1000.0])

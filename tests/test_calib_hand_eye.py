@@ -17,6 +17,7 @@ from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.hand_eye import PARAMETERS, mount_camera
 from hybridve.calib.placing.mount_fit import solve_hand_eye
 from hybridve.calib.pose import Pose, angle_between, compose, invert
+from hybridve.calib.record import MountRecord
 from hybridve.calib.rig import Mount
 
 BOARD = Chessboard(8, 5, 0.1)
@@ -70,7 +71,7 @@ class Walk:
         world_from_tracker = compose(invert(cam_from_world), self.mount.cam_from_tracker)
         return compose(tracking_from_world, world_from_tracker)
 
-    def solved(self, **changes: Any) -> tuple[Mount, dict[str, Any]]:
+    def solved(self, **changes: Any) -> tuple[Mount, MountRecord]:
         said: dict[str, Any] = {"sightings": self.sightings, "tracked": self.tracked, **changes}
         return mount_camera(CAMERA, [BOARD], said["sightings"], said["tracked"])
 
@@ -187,7 +188,7 @@ def test_the_order_of_pictures_does_not_matter() -> None:
     [{"noise_px": 0.3}, {"tracker_rad": 0.003, "tracker_m": 0.002, "noise_px": 0.1}],
     ids=["corners", "tracker"],
 )
-def test_errors_are_as_large_as_the_covariance_says(noise: dict[str, float]) -> None:
+def test_errors_are_as_large_as_the_covariance_says(noise: dict[str, Any]) -> None:
     squares, pose_squares = [], []
     for seed in range(16):
         walk = Walk(seed, **noise)

@@ -76,7 +76,8 @@ def seen_around(
         ]
         assert observed.picture is not None
         image = np.ascontiguousarray(observed.picture[:, ::-1])
-        seen.append(in_picture(replace(observed, sightings=(*stills, None)), board, image))
+        last = observed.sightings[-1]  # of the clip, in whose place the mirrored one is put
+        seen.append(in_picture(replace(observed, sightings=(*stills, last)), board, image))
     return (*cameras, *map(lens_mirrored, cameras)), tuple(seen)
 
 

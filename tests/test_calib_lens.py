@@ -218,7 +218,7 @@ def test_a_pinhole_needs_no_undistortion() -> None:
         ({"model": "OPENCV", "params": np.ones(8), "skew_px": 1.0}, "takes no skew"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused_by_name(changes: dict[str, object], found: str) -> None:
+def test_a_camera_that_cannot_be_is_refused_by_name(changes: dict[str, Any], found: str) -> None:
     camera = make_camera("cam7", "PINHOLE", POSE)
 
     with pytest.raises(CalibrationError, match=rf"'cam7'.*{found}"):
@@ -388,9 +388,8 @@ def test_a_camera_that_abstains_does_not_carve_where_its_lens_shows_nothing() ->
     whole = undistortion(camera)
     assert whole.map_x is not None
     rows, columns = np.nonzero(whole.map_x == -1)
-    rays = np.linalg.solve(
-        whole.img_from_cam, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
-    ).T
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    rays = np.asarray(np.linalg.solve(whole.img_from_cam, pixels).T, np.float64)
     points_world = transform(invert(camera.cam_from_world), 1.5 * rays)
     recorded = np.full((HEIGHT_PX, WIDTH_PX), 255, np.uint8)  # object wherever a camera looks
     masks = [undistort_mask(recorded, lens) for lens in lenses]

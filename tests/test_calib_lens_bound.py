@@ -124,7 +124,7 @@ def size_px(camera: Camera) -> NDArray[np.int64]:
 
 def answers(mask: Mask, places: Array) -> NDArray[np.bool_]:
     """Return what a silhouette says at places (N, 2): the floor is the pixel, beyond is nothing."""
-    inside = ((places >= 0) & (places < mask.shape[::-1])).all(axis=1)
+    inside = np.asarray(((places >= 0) & (places < mask.shape[::-1])).all(axis=1))
     columns, rows = np.floor(np.where(inside[:, None], places, 0.0)).astype(int).T
     return np.asarray(inside & (mask[rows, columns] != 0))
 
@@ -264,7 +264,7 @@ def bound_and_largest(camera: Camera, seed: int) -> tuple[float, float]:
     assert (lens.map_x >= -0.5).sum() > 1000
     rng = np.random.default_rng(seed)
     rows, columns = np.indices(lens.map_x.shape).reshape(2, -1)
-    centers = np.column_stack([columns, rows]) + 0.5
+    centers = np.asarray(np.column_stack([columns, rows]) + 0.5, np.float64)
     sourced = lens.map_x[rows, columns] >= -0.5
     taken_from = recorded_at(camera, lens, centers)
     taken_from[sourced] = np.column_stack([lens.map_x.ravel(), lens.map_y.ravel()])[sourced] + 0.5

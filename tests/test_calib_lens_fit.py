@@ -60,7 +60,8 @@ def seen_partly(
 ) -> tuple[list[Pose], list[NDArray[np.float64]]]:
     """Return boards all over what a lens sees; corners outside the image are not seen."""
     rng = np.random.default_rng(count)
-    poses, views = [], []
+    poses: list[Pose] = []
+    views: list[NDArray[np.float64]] = []
     while len(poses) < count:
         off = np.deg2rad(half_angle_deg) * np.sqrt(rng.uniform())
         around = rng.uniform(0.0, 2.0 * np.pi)

@@ -1,6 +1,7 @@
 """Cameras hang together by what they saw at once; what does not is named."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def assert_linked(linked: Linked, recording: Recording, tolerance: float = EXACT
         assert np.nanmax(np.abs(projected - view.pixels)) < 2000 * tolerance
 
 
-def passing_by(n_cameras: int, per_camera: int = 4, seed: int = 0, **how: object) -> Recording:
+def passing_by(n_cameras: int, per_camera: int = 4, seed: int = 0, **how: Any) -> Recording:
     """A board carried along a row of cameras: each sees it together with its neighbours only."""
     rng = np.random.default_rng(seed)
     cameras = row_of_cameras(n_cameras, spacing_m=1.3)
@@ -206,7 +207,7 @@ def facing(n_near: int, n_far: int) -> list[Camera]:
     return near + far
 
 
-def panel_recording(cameras: list[Camera], n: int = 12, **how: object) -> Recording:
+def panel_recording(cameras: list[Camera], n: int = 12, **how: Any) -> Recording:
     rng = np.random.default_rng(8)
     front = BACK_TO_BACK[0]
     poses = {k: held_up(rng, front, (0.1, 0.0, 0.0)) for k in range(n)}

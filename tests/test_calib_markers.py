@@ -121,7 +121,7 @@ def test_kalibrs_tags_run_from_the_bottom_left_and_their_corners_counterclockwis
 
     np.testing.assert_allclose(
         APRIL.points_board[[0, 1, 2, 3, 4, 12]],
-        [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0], [0.13, 0, 0], [0, 0.13, 0]],
+        np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0], [0.13, 0, 0], [0, 0.13, 0]]),
         atol=1e-12,
     )
     corners = APRIL.detect(image).corners

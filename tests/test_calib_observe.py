@@ -430,7 +430,9 @@ def filmed(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("filmed")
     for name, what in itertools.product(("left", "right"), ("stills", "clip")):
         paths = open_source(recorded, f"{name}/{what}/*.png").paths
-        images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
+        images = [
+            np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8) for path in paths
+        ]
         write_video(root / name / f"{what}.avi", images)
     return root
 

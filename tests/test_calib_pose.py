@@ -21,7 +21,7 @@ def vectors(n: int = 20_000) -> NDArray[np.float64]:
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     small = 10.0 ** rng.uniform(-17.0, -1.0, n)
     angles = np.choose(np.arange(n) % 3, [small, np.pi - small, rng.uniform(0.0, np.pi, n)])
-    return axes * angles[:, None]
+    return np.asarray(axes * angles[:, None])
 
 
 def rodrigues(vectors: NDArray[np.float64]) -> NDArray[np.longdouble]:
@@ -83,7 +83,7 @@ def test_a_pose_moves_in_the_frame_it_leads_to_or_turns_about_its_own_origin() -
     points = rng.normal(size=(30, 3))
 
     def placed(some: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.einsum("nij,nj->ni", some[:, :, :3], points) + some[:, :, 3]
+        return np.asarray(np.einsum("nij,nj->ni", some[:, :, :3], points) + some[:, :, 3])
 
     before, origins = placed(poses), poses[:, :, 3]
     moved, turned = moved_pose(poses, changes), turned_pose(poses, changes)

@@ -220,7 +220,7 @@ def rig() -> Rig:
 
 def test_every_field_of_a_record_and_of_a_check_is_tried() -> None:
     """A field that is added must be given a value above, and so is tried below."""
-    kinds = {
+    kinds: set[Any] = {
         kind
         for module in (record_module, verdict_module)
         for kind in vars(module).values()

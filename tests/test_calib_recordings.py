@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.boards import turned_about
+from helpers.records import record_of
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Observations
@@ -87,9 +88,11 @@ def test_horseman_cameras_stand_where_two_calibrations_have_them(horseman: Rig) 
 
 
 def test_horseman_corners_miss_by_less_than_half_a_pixel(horseman: Rig) -> None:
-    for told in horseman.provenance.cameras.values():
+    for told in record_of(horseman).cameras.values():
+        assert told.intrinsics.rms_px is not None
         assert told.intrinsics.rms_px < 0.5
         assert told.intrinsics.views_used >= 10
+        assert told.extrinsics.rms_px is not None
         assert told.extrinsics.rms_px < 0.2
         assert told.extrinsics.how.startswith("detected")
     assert json.dumps(rig_to_dict(horseman), allow_nan=False)
@@ -112,9 +115,11 @@ def test_horseman_cameras_are_above_the_floor_and_upright(horseman: Rig) -> None
 
 
 def test_the_scene_tells_which_way_round_horsemans_board_was_seen(horseman: Rig) -> None:
-    evidence = horseman.provenance.labelling
+    evidence = record_of(horseman).labelling
+    assert evidence is not None
     assert evidence.looks == 2
     assert evidence.decided_by == "matches of the scene"
+    assert evidence.weakest_sigma is not None
     assert evidence.weakest_sigma > 5.0
 
 
@@ -143,7 +148,7 @@ def test_marks_set_the_world_that_their_reference_has(
     for camera in reference.cameras:
         off_m = np.linalg.norm(marked[camera.name].center_world - camera.center_world)
         assert off_m < 0.15  # of up to 4.3 m; turned the other way round it would be metres
-    assert all("detected" in told.extrinsics.how for told in marked.provenance.cameras.values())
+    assert all("detected" in told.extrinsics.how for told in record_of(marked).cameras.values())
 
 
 @pytest.mark.parametrize(
@@ -299,8 +304,8 @@ def test_a_stereo_pair_of_moving_boards_has_its_published_baseline(recordings: P
 
     baseline = np.linalg.norm(rig["left"].center_world - rig["right"].center_world)
     assert baseline == pytest.approx(STEREO_BASELINE, rel=STEREO_RELATIVE)
-    assert rig.provenance.rms_px < 0.25
-    assert rig.provenance.cameras["left"].extrinsics.views_used == 13
+    assert record_of(rig).rms_px < 0.25
+    assert record_of(rig).cameras["left"].extrinsics.views_used == 13
 
 
 def test_a_stereo_pair_in_two_files_is_taken(recordings: Path) -> None:

@@ -33,6 +33,7 @@ from hybridve.calib.solving.bundle import POSE, Adjusted, Bundle, adjust
 from hybridve.calib.solving.colmap_adjust import colmap_adjust
 from hybridve.calib.solving.covariance import even_covariance, rig_covariance
 from hybridve.calib.solving.errors_in_space import parameter_slices, point_errors, point_gains
+from hybridve.calib.solving.noise import measure_group_noise
 from hybridve.calib.solving.second_opinion import second_opinion
 
 SCENE = still_scene(n_cameras=3, n_stills=7)
@@ -246,7 +247,7 @@ def test_a_camera_nudged_after_colmaps_adjustment_is_a_doubt(
 
 
 def test_a_clip_that_is_given_a_wrong_weight_is_a_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
-    measured = fixed_cameras.measure_group_noise
+    measured = measure_group_noise
 
     def too_sure(*given: Any) -> dict[str, Noise]:
         told = measured(*given)

@@ -14,6 +14,7 @@ from helpers.boards import (
     relative_error,
     ring,
 )
+from helpers.records import record_of
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Observations, Sighting
@@ -59,7 +60,7 @@ def test_noise_free_corners_give_back_the_rig(model: str) -> None:
     rig = solve_rig([BOARD], observe_exactly(BOARD, cameras)).rig
 
     assert_same_rig(rig, cameras)
-    assert rig.provenance.rms_px < EXACT_PX
+    assert record_of(rig).rms_px < EXACT_PX
 
 
 @pytest.mark.slow
@@ -106,8 +107,8 @@ def test_the_error_that_is_told_is_the_noise_that_was_there() -> None:
     rig = solve_rig([BOARD], observe_exactly(BOARD, cameras, n_stills=30, noise_px=noise_px)).rig
 
     # Length of a two-dimensional error; parameters take up a few percent.
-    assert rig.provenance.rms_px == pytest.approx(noise_px * np.sqrt(2), rel=0.06)
-    for told in rig.provenance.cameras.values():
+    assert record_of(rig).rms_px == pytest.approx(noise_px * np.sqrt(2), rel=0.06)
+    for told in record_of(rig).cameras.values():
         assert told.intrinsics.rms_px == pytest.approx(noise_px * np.sqrt(2), rel=0.1)
         assert told.intrinsics.views_used == 30
 
@@ -144,7 +145,7 @@ def test_blurred_and_wrong_views_are_dropped_and_named() -> None:
 
     rig = solve_rig([BOARD], [with_stills(seen, corners)]).rig
 
-    told = rig.provenance.cameras["cam1"].intrinsics
+    told = record_of(rig).cameras["cam1"].intrinsics
     assert set(told.views_dropped) == {"blurred", "bent", "another board"}
     assert all("px" in reason for reason in told.views_dropped.values())
     assert told.views_used == 14
@@ -162,6 +163,7 @@ def test_a_corner_that_misses_by_far_is_left_out_and_listed() -> None:
 
     told = solve_rig([BOARD], observations).record.adjustment
 
+    assert told is not None
     assert told.outliers == 1
     (outlier,) = told.worst_outliers
     assert (outlier.camera, outlier.image, outlier.point) == ("cam1", "4.png", 17)
@@ -330,5 +332,5 @@ def test_settings_reach_the_provenance() -> None:
 
     rig = solve_rig([BOARD], observations, settings).rig
 
-    assert rig.provenance.settings["lens"]["loss_px"] == 0.5
-    assert rig.provenance.boards == (BoardRecord("board", None, str(BOARD)),)
+    assert record_of(rig).settings["lens"]["loss_px"] == 0.5
+    assert record_of(rig).boards == (BoardRecord("board", None, str(BOARD)),)

@@ -105,6 +105,7 @@ def test_all_ways_find_the_same_world(seed: int) -> None:
     marks = clicked(cameras, rig_from_world, TRUE_POINTS)
     by_points = place_world("points", cameras, seen, marks)
     assert_same(by_points, world_from_rig)
+    assert by_points.told.residuals_mm is not None
     assert max(by_points.told.residuals_mm.values()) < 1e-3
     assert by_points.told.scale == pytest.approx(1.0, abs=1e-5)
     assert not by_points.told.warnings
@@ -171,8 +172,10 @@ def test_noise_of_clicks_is_told_in_mm() -> None:
 
     told = place_by_points(cameras, marks).told
 
-    assert max(told.residuals_mm, key=lambda name: told.residuals_mm[name]) == "p4"
-    assert 1.0 < told.residuals_mm["p4"] < 50.0
+    missed_mm = told.residuals_mm
+    assert missed_mm is not None
+    assert max(missed_mm, key=lambda name: missed_mm[name]) == "p4"
+    assert 1.0 < missed_mm["p4"] < 50.0
     (warning,) = told.warnings
     assert "point 'p4'" in warning
 
@@ -260,6 +263,7 @@ def test_the_board_need_not_lie_on_the_floor() -> None:
     np.testing.assert_allclose(middle[:2], 0.0, atol=EXACT_M)
     along = (world_from_rig[:, :3] @ tilt)[:, 0]
     assert abs(along[1]) < EXACT_M < along[0]
+    assert placed.told.residuals_mm is not None
     assert max(map(abs, placed.told.residuals_mm.values())) < 1e-3
 
 
@@ -270,6 +274,7 @@ def test_a_point_off_the_floor_shows() -> None:
 
     told = place_on_floor(cameras, lying([np.eye(3, 4)], [0], [[0, 1]]), marks).told
 
+    assert told.residuals_mm is not None
     assert told.residuals_mm["p4"] == pytest.approx(16.0, abs=0.5)  # 20 mm, less the mean
 
 

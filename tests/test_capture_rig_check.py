@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -186,7 +187,12 @@ def test_a_rig_is_asked_again_when_the_clip_the_board_or_the_rig_changes(
     rows = (session.parent / "rig.csv").read_text(encoding="utf-8")
     picture = (session.parent / "cam1" / "board.png").read_bytes()
     asked: list[int] = []
-    monkeypatch.setattr(rig_check, "find_boards", lambda *_, **__: asked.append(1) or [])
+
+    def find_none(*_: Any, **__: Any) -> list[Any]:
+        asked.append(1)
+        return []
+
+    monkeypatch.setattr(rig_check, "find_boards", find_none)
 
     def is_asked() -> bool:
         asked.clear()

@@ -73,7 +73,11 @@ def in_front() -> list[Camera]:
     ]
 
 
-def write(path: Path, image: NDArray[np.uint8]) -> None:
+def read(path: Path) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+def write(path: Path, image: cv2.typing.MatLike) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), image)
 
@@ -90,9 +94,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write(folder / "clip/0.png", picture)
     write(root / "cam2/bumped/0.png", render_board(bumped(around()[1]), BOARD, samples=2))
     for number in range(4):
-        still = cv2.imread(str(root / f"cam2/stills/{number}.png"), cv2.IMREAD_GRAYSCALE)
+        still = read(root / f"cam2/stills/{number}.png")
         write(root / f"cam2/turned/stills/{number}.png", cv2.rotate(still, cv2.ROTATE_180))
-    still = cv2.imread(str(root / "cam2/clip/0.png"), cv2.IMREAD_GRAYSCALE)
+    still = read(root / "cam2/clip/0.png")
     write(root / "cam2/turned/clip/0.png", cv2.rotate(still, cv2.ROTATE_180))
     rng = np.random.default_rng(3)
     for number in range(4):

@@ -222,7 +222,7 @@ def test_the_chart_shows_counts_and_answers_where_they_belong() -> None:
     axes = draw_spacing_chart(curves, title="part").axes[0]
 
     steps = [patch.get_data() for patch in axes.patches if isinstance(patch, StepPatch)]
-    drawn = [(step.values.tolist(), step.edges.tolist()) for step in steps]
+    drawn = [(values.tolist(), edges.tolist()) for values, edges, _ in steps]
     for curve in curves:
         for values in (curve.violated, curve.at_most):
             assert (values.tolist(), shift_mm.tolist()) in drawn

@@ -21,7 +21,7 @@ from hybridve.hull.contact.uncertainty import Doubt
 from hybridve.hull.curves import write_curves
 from hybridve.hull.report import machine
 from hybridve.hull.report.read import read_report
-from hybridve.hull.report.schema import FrameResult, ReportHeader
+from hybridve.hull.report.schema import FrameResult, ReportHeader, State
 from hybridve.hull.report.summarize import failing, summarize
 from hybridve.hull.report.write import ReportWriter
 
@@ -66,6 +66,7 @@ ENTRY = deep(
     approach_m_s=(0.2, 0.3),
     recovery=Recovery("no", 0.04, 0.05),
 )
+assert ENTRY.response is not None
 LOST = replace(ENTRY.response, d_rec_m=np.nan, status="no exit")
 PHANTOM = replace(
     DOUBT, survives=False, hinges_on=("cam2", "cam1"), component="unsure", at_least_m=np.nan
@@ -103,7 +104,7 @@ def path(tmp_path: Path) -> Path:
         for row, finding in enumerate(FRAMES):
             findings = () if finding is None else (verdict_on(finding, 0.01),)
             reason = "torn" if finding is None else ""
-            state = "unread" if finding is None else "evaluated"
+            state: State = "unread" if finding is None else "evaluated"
             writer.append(FrameResult(row + 100, row / 10, reason, findings, {}, state))
         writer.finish()
     return path

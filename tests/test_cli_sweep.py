@@ -11,7 +11,7 @@ from helpers.sessions import write_ball_session, write_cube_scene
 
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query import choose
-from hybridve.hull.query.engine import Engine
+from hybridve.hull.query.engine import Engine, EngineName
 from hybridve.hull.report.sweep_file import read_sweep, sweep_as_dict
 from hybridve.hull.sweep import experiment
 
@@ -149,7 +149,7 @@ def test_engines_that_do_not_open_are_left_out_unless_they_were_named(
 ) -> None:
     really_open = choose.open_engine
 
-    def open_without_opengl(name: str = "auto") -> Engine:
+    def open_without_opengl(name: EngineName = "auto") -> Engine:
         if name in ("compute", "stencil"):
             raise DeviceError("no OpenGL here")
         return really_open(name)

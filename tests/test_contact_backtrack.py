@@ -48,7 +48,7 @@ def engine() -> Iterator[Native]:
 def distance_to(center: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far each pixel's centre is from a point (x, y), in pixels."""
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    return np.hypot(x - center[0], y - center[1])
+    return np.asarray(np.hypot(x - center[0], y - center[1]))
 
 
 def disc(center: NDArray[np.float64], radius_px: float) -> NDArray[np.uint8]:

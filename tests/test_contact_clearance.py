@@ -17,7 +17,8 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 
 
 def box(size_m: tuple[float, float, float], center: tuple[float, float, float]) -> Mesh:
-    mesh = box_mesh(tuple(1000 * size for size in size_m), 100.0)
+    x, y, z = (1000 * size for size in size_m)
+    mesh = box_mesh((x, y, z), 100.0)
     return mesh.vertices_mm / 1000 + np.array(center), mesh.faces.astype(np.int32)
 
 
@@ -180,7 +181,7 @@ def _segment_distance(
     way = b - a
     length = np.maximum((way * way).sum(axis=-1), 1e-300)
     along = np.clip(((points[:, None] - a) * way).sum(axis=-1) / length, 0, 1)
-    return np.linalg.norm(points[:, None] - a - along[..., None] * way, axis=-1)
+    return np.asarray(np.linalg.norm(points[:, None] - a - along[..., None] * way, axis=-1))
 
 
 def _soup_distance(
@@ -200,7 +201,7 @@ def _soup_distance(
         side = np.cross(stop - start, points[:, None] - start)
         over &= np.einsum("ntk,tk->nt", side, normal) >= 0
     height = np.abs(np.einsum("ntk,tk->nt", points[:, None] - a, normal))
-    return np.where(over, np.minimum(height, distance), distance).min(axis=1)
+    return np.asarray(np.where(over, np.minimum(height, distance), distance).min(axis=1))
 
 
 def test_distances_agree_with_the_specification_on_slivers_too() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.cones import hull_of_balls, views_from
-from helpers.hulls import MASK_KINDS, ball_hull, random_masks, random_views, ring_views
+from helpers.hulls import MASK_KINDS, UNSEEN, ball_hull, random_masks, random_views, ring_views
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ def crossing(
 ) -> NDArray[np.float64]:
     """Return where the lines from a and from b meet, in a plane of constant z."""
     along = np.column_stack([(through_a - a)[:2], -(through_b - b)[:2]])
-    return a + np.linalg.solve(along, (b - a)[:2])[0] * (through_a - a)
+    return np.asarray(a + np.linalg.solve(along, (b - a)[:2])[0] * (through_a - a))
 
 
 def tell(hull: Hull) -> tuple[Volumes, list[bool]]:
@@ -161,7 +161,7 @@ def test_cells_are_not_much_larger_than_the_hull() -> None:
 def hulls(draw: st.DrawFn) -> Hull:
     n_cameras = draw(st.integers(1, 6))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    unseen = draw(st.sampled_from(["carve", "keep"]))
+    unseen = draw(st.sampled_from(UNSEEN))
     views = random_views(rng, n_cameras, unseen, draw(st.integers(1, n_cameras)))
     return make_hull(views, random_masks(rng, views, rng.choice(MASK_KINDS, n_cameras).tolist()))
 

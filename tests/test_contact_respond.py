@@ -7,6 +7,7 @@ to the pixel footprint wherever one camera alone ends the hull.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -274,7 +275,7 @@ def test_a_contact_that_does_not_collide_has_no_response() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_points_that_are_none_are_named(value: float) -> None:
     hull = ball_hull(ring_views(), np.zeros(3), 0.2)
-    contact = Contact("", np.zeros((1, 3), np.float32), np.zeros(1, np.uint32))
+    contact = contact_at()
     nowhere = np.array([0.0, value, 0.0])
 
     with pytest.raises(ValueError, match=r"RP_obj is .* expected a finite point"):
@@ -318,7 +319,7 @@ def test_a_recovery_direction_has_a_length(direction: list[float]) -> None:
         ({"window": 0}, "window"),
     ],
 )
-def test_settings_that_are_no_triangle_are_refused(wrong: dict[str, float], name: str) -> None:
+def test_settings_that_are_no_triangle_are_refused(wrong: dict[str, Any], name: str) -> None:
     with pytest.raises(ValueError, match=name):
         ResponseSettings(**wrong)
 

@@ -104,6 +104,6 @@ def test_the_worst_of_several_is_the_first_in_order(verdicts: set[str]) -> None:
 
     if verdicts:
         assert found in verdicts
-        assert all(VERDICTS.index(found) <= VERDICTS.index(one) for one in verdicts)  # type: ignore[arg-type]
+        assert all(VERDICTS.index(found) <= VERDICTS.index(one) for one in verdicts)
     else:
         assert found == "unknown"

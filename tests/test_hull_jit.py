@@ -182,7 +182,8 @@ def test_after_preparing_detect_compiles_nothing(
     centers = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.9, 0, 0]])
     session = write_ball_session(tmp_path, centers)
     scene = write_cube_scene(tmp_path, {"near": (0.0, 0.0, 150.0), "touched": (0.0, 0.0, 305.0)})
-    arguments = [session, "--scene", scene, "-o", tmp_path / "report.h5", "--engine", "native"]
+    report = tmp_path / "report.h5"
+    arguments: list[str | Path] = [session, "--scene", scene, "-o", report, "--engine", "native"]
 
     detected = subprocess.run(
         [sys.executable, "-m", "hybridve.cli", "detect", *arguments],

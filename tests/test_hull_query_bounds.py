@@ -8,6 +8,7 @@ from helpers.hulls import (
     EMPTYING_MASK_KINDS,
     MASK_KINDS,
     TRIANGLE_KINDS,
+    UNSEEN,
     assert_same_samples,
     ball_hull,
     random_corners,
@@ -22,14 +23,14 @@ from hypothesis import strategies as st
 from hybridve.hull.query.bounds import FREE, FULL, OPEN, boxes_are_free, verdicts
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference, contains_points
-from hybridve.hull.query.silhouettes import Hull, make_hull, make_seen
+from hybridve.hull.query.silhouettes import Hull, Unseen, make_hull, make_seen
 
 
 @st.composite
 def hulls(draw: st.DrawFn) -> Hull:
     n_cameras = draw(st.integers(1, 6))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    unseen = draw(st.sampled_from(["carve", "keep"]))
+    unseen = draw(st.sampled_from(UNSEEN))
     views = random_views(rng, n_cameras, unseen, draw(st.integers(1, n_cameras)))
     kinds = rng.choice(MASK_KINDS + EMPTYING_MASK_KINDS, n_cameras).tolist()
     return make_hull(views, random_masks(rng, views, kinds))
@@ -69,7 +70,7 @@ def test_a_free_box_holds_no_point_of_the_hull(hull: Hull, seed: int, reach_m: f
 
 
 @pytest.mark.parametrize("unseen", ["carve", "keep"])
-def test_boxes_around_a_ball_are_proved_free_up_to_the_pixels(unseen: str) -> None:
+def test_boxes_around_a_ball_are_proved_free_up_to_the_pixels(unseen: Unseen) -> None:
     """A proof that never succeeds would pass every other test here."""
     views = ring_views(6, unseen=unseen)
     hull = ball_hull(views, np.zeros(3), 0.2)

@@ -1,6 +1,7 @@
 """Certificates: what is proved free is free at any viewport, what collides has a witness."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -223,7 +224,8 @@ def test_a_triangle_that_needs_too_many_cells_is_open_at_the_size_it_reached(
     corners = np.array([[[-0.03, -0.03, 0.0], [0.03, -0.02, 0.0], [0.01, 0.03, 0.0]]])
     mesh = soup(views, corners - views.origin_world, np.ones(1, np.int32))
 
-    few, many = [], []
+    few: list[Any] = []
+    many: list[Any] = []
     for most_cells, found in ((100, few), (1 << 17, many)):
         monkeypatch.setattr(certify_module, "MOST_CELLS", most_cells)
         certificates = certify_triangles(hull, mesh, 1e-4)

@@ -25,7 +25,7 @@ from hybridve.hull.query.clusters import spatial_order
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.rectangles import CLUSTER
-from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.query.silhouettes import Hull, Unseen, make_hull
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_clusters_take_the_same_samples(
     seed: int,
     n_cameras: int,
     n_triangles: int,
-    unseen: str,
+    unseen: Unseen,
     is_sorted: bool,
     n_threads: int,
     data: st.DataObject,

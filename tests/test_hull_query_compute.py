@@ -70,7 +70,7 @@ def matrix_world(views: Views, camera: int) -> NDArray[np.float64]:
     """Return the (3, 4) projection of a camera, from the world."""
     matrix = views.img_from_local[camera].copy()
     matrix[:, 3] -= matrix[:, :3] @ views.origin_world
-    return matrix
+    return np.asarray(matrix)
 
 
 def random_scene(seed: int, n_triangles: int, n_cameras: int = 4) -> tuple[Hull, Triangles]:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hybridve.calib.errors import DeviceError
 from hybridve.hull.query import compute as compute_module
 from hybridve.hull.query.choose import open_engine
-from hybridve.hull.query.engine import MAX_COORDINATE_M, Hits, Triangles
+from hybridve.hull.query.engine import MAX_COORDINATE_M, EngineName, Hits, Triangles
 
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -58,7 +58,7 @@ def test_an_empty_mesh_is_a_mesh() -> None:
 
 def test_a_mesh_does_not_change_with_the_arrays_it_was_made_from() -> None:
     vertices, faces = VERTICES.copy(), FACES.astype(np.int64)
-    mesh = Triangles(vertices, faces, VIEWPORTS)
+    mesh = Triangles(vertices, faces, VIEWPORTS)  # type: ignore[arg-type]  # any whole numbers
 
     vertices[:] = 7.0
     faces[:] = 0
@@ -129,7 +129,7 @@ def test_runs_hold_the_samples_they_were_made_of(
         pytest.param("stencil", marks=pytest.mark.gl),
     ],
 )
-def test_an_engine_is_opened_by_name(name: str) -> None:
+def test_an_engine_is_opened_by_name(name: EngineName) -> None:
     with open_engine(name) as engine:
         assert engine.name == name
         assert engine.renderer
@@ -137,7 +137,7 @@ def test_an_engine_is_opened_by_name(name: str) -> None:
 
 def test_an_unknown_engine_is_refused() -> None:
     with pytest.raises(ValueError, match="engine 'warp', expected auto, compute"):
-        open_engine("warp")
+        open_engine("warp")  # type: ignore[arg-type]  # not that one
 
 
 class FakeCompute:

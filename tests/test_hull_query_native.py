@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.compiled import source_of
 from helpers.hulls import (
     assert_same_samples,
     ball_hull,
@@ -24,7 +25,7 @@ from hybridve.hull.query.bounds import FREE, OPEN, verdicts
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference
-from hybridve.hull.query.silhouettes import make_hull
+from hybridve.hull.query.silhouettes import Unseen, make_hull
 
 
 @pytest.mark.slow
@@ -51,8 +52,8 @@ def test_only_what_rectangles_leave_open_is_sampled(
         engine.query(ball_hull(views, np.zeros(3), 0.2), [mesh])
     # Run the compiled loop's source, so that it can be listened to.
     monkeypatch.setattr(rectangles_module, "_batch_verdicts", spy)
-    monkeypatch.setattr(native_module, "survivors", native_module.survivors.py_func)
-    monkeypatch.setattr(native_module, "_query", native_module._query.py_func)
+    monkeypatch.setattr(native_module, "survivors", source_of(rectangles_module.survivors))
+    monkeypatch.setattr(native_module, "_query", source_of(native_module._query))
     engine.query(hull, [mesh])
 
     is_asked = np.isin(np.arange(len(mesh)), asked)
@@ -66,7 +67,7 @@ def test_only_what_rectangles_leave_open_is_sampled(
 
 @pytest.mark.parametrize("viewport", [1, 2, 7, 8, 9, 16, 17, 63, 64, 65, 129, 200])
 @pytest.mark.parametrize("unseen", ["carve", "keep"])
-def test_grids_of_any_size_are_covered(viewport: int, unseen: str) -> None:
+def test_grids_of_any_size_are_covered(viewport: int, unseen: Unseen) -> None:
     rng = np.random.default_rng(viewport)
     views = random_views(rng, 3, unseen, min_cameras=2, gaps=False)
     hull = make_hull(views, random_masks(rng, views, ["noise", "blobs", "holes"]))

@@ -9,7 +9,6 @@ import pytest
 from helpers.hulls import EDGE_BAND_PX, ball_hull, differences, is_in_order, ring_views, sphere_mesh
 
 from hybridve.calib.errors import DeviceError
-from hybridve.hull.query import device as device_module
 from hybridve.hull.query.compute import Compute
 from hybridve.hull.query.device import open_device
 from hybridve.hull.query.engine import Triangles
@@ -21,7 +20,9 @@ pytestmark = pytest.mark.gl
 OpenGL = Compute | Stencil
 
 native = Native(n_threads=1)
-both = pytest.mark.parametrize("kind", [Compute, Stencil])
+KINDS: list[type[OpenGL]] = [Compute, Stencil]
+
+both = pytest.mark.parametrize("kind", KINDS)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,7 @@ def test_without_opengl_one_line_says_what_to_install(
     def no_library(**settings: object) -> None:
         raise Exception("libEGL.so not loaded")
 
-    monkeypatch.setattr(device_module.moderngl, "create_context", no_library)
+    monkeypatch.setattr(moderngl, "create_context", no_library)
 
     with pytest.raises(DeviceError, match=r"libEGL.so not loaded.*libegl1.*libgl1-mesa-dri"):
         kind()
@@ -97,7 +98,7 @@ def test_closing_twice_is_harmless(context: moderngl.Context, kind: type[OpenGL]
     assert context.error == "GL_NO_ERROR"
 
 
-@pytest.mark.parametrize("kinds", list(product([Compute, Stencil], repeat=2)))
+@pytest.mark.parametrize("kinds", list(product(KINDS, repeat=2)))
 def test_engines_with_devices_of_their_own_take_turns(
     kinds: tuple[type[OpenGL], type[OpenGL]],
 ) -> None:

@@ -142,8 +142,8 @@ def test_samples_are_asked_across_chunks_in_order(monkeypatch: pytest.MonkeyPatc
     corners = np.array([[[0.1, 0.5, 1.0], [3.1, 0.5, 1.0], [0.1, 0.5, 1.0]]])
     mesh = Triangles(
         np.tile(corners, (4, 1, 1)).reshape(-1, 3),
-        np.arange(12).reshape(4, 3),
-        np.array([1, 2, 3, 2]),
+        np.arange(12, dtype=np.int32).reshape(4, 3),
+        np.array([1, 2, 3, 2], np.int32),
     )
     expected_triangle = [0, 1, 1, 2, 2, 2, 2, 2, 3, 3]
     # Of six samples of a 3 x 3 viewport only number 2, vertex b, lies in the last column.

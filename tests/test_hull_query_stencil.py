@@ -31,7 +31,7 @@ from hybridve.hull.query.device import open_device
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull
 from hybridve.hull.query.stencil import Stencil
 
 pytestmark = pytest.mark.gl
@@ -115,8 +115,8 @@ def test_what_is_larger_than_the_window_is_drawn_in_tiles(clean: moderngl.Contex
     for (row, column), pixels in zip(tiles, drawn, strict=True):
         n_rows = min(32, 75 - row)
         whole[row : row + n_rows, column : column + 32] = pixels[:n_rows]
-    row, column = np.indices(whole.shape)
-    np.testing.assert_array_equal(whole, 3 * (row + column <= 74))
+    rows, columns = np.indices(whole.shape)
+    np.testing.assert_array_equal(whole, 3 * (rows + columns <= 74))
 
 
 @pytest.mark.parametrize("window_px", [10, 31, 200])
@@ -254,7 +254,7 @@ def test_one_background_outweighs_every_object_pixel(stencil: Stencil) -> None:
 
 @pytest.mark.parametrize(("unseen", "most"), [("carve", 255), ("keep", 254)])
 def test_more_cameras_than_a_counter_counts_are_refused(
-    stencil: Stencil, unseen: str, most: int
+    stencil: Stencil, unseen: Unseen, most: int
 ) -> None:
     mesh = in_view(2, 3)
     hits = stencil.query(full_hull(ring_views(most, 60, 40, 50.0, unseen=unseen)), [mesh])

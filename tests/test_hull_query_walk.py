@@ -241,7 +241,7 @@ def test_ends_are_those_of_rational_arithmetic() -> None:
             "carve" if needed is None else "keep",
             needed or 1,
         )
-        length = np.linalg.norm(direction)
+        length = float(np.linalg.norm(direction))
 
         spans_m = spans_in_hull(
             make_hull(views, masks), start.astype(float), direction.astype(float), 6 * length

@@ -1,7 +1,7 @@
 """A report is complete or absent, and what is written is what is read."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,7 +18,7 @@ from hybridve.calib.errors import ReportError
 from hybridve.hull.agreement.outlines import CUT, FIRST, Outline
 from hybridve.hull.contact.backtrack import FirstContact
 from hybridve.hull.contact.clearance import Clearance
-from hybridve.hull.contact.detect import Body, Contact
+from hybridve.hull.contact.detect import Body, Certificate, Contact
 from hybridve.hull.contact.finding import Finding, judged
 from hybridve.hull.contact.patches import Patch
 from hybridve.hull.contact.recovery import Recovery
@@ -30,7 +30,7 @@ from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.machine import Run
 from hybridve.hull.report.read import read_points, read_report
 from hybridve.hull.report.result_file import Kind
-from hybridve.hull.report.schema import STAGES, CameraFrame, FrameResult, ReportHeader
+from hybridve.hull.report.schema import STAGES, CameraFrame, FrameResult, ReportHeader, State
 from hybridve.hull.report.summarize import spans, summarize
 from hybridve.hull.report.write import ReportWriter
 
@@ -42,6 +42,8 @@ _FEW = settings(
 
 
 CAMERAS = ("left", "right", "top")
+CERTIFICATES: tuple[Certificate, ...] = get_args(Certificate)
+UNREAD: tuple[State, ...] = ("unread", "contradictory")
 PARTS = ("clearance", "first contact", "response", "recovery", "doubt")
 
 #: What the reports are about: two objects, and a frame far from the world's origin.
@@ -70,7 +72,7 @@ def local_mesh(body: Body) -> StoredMesh:
 
 
 def a_result(index: int, *contacts: Contact, reason: str = "") -> FrameResult:
-    state = "unread" if reason else "evaluated"
+    state: State = "unread" if reason else "evaluated"
     findings = tuple(
         judged(Finding(one), is_closed=False, required_m=0.0, share_seen=1.0, rests_on="")
         for one in contacts
@@ -80,7 +82,7 @@ def a_result(index: int, *contacts: Contact, reason: str = "") -> FrameResult:
 
 def a_contact(draw: st.DrawFn, rng: np.random.Generator, body: Body) -> Contact:
     share = draw(st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0]))
-    certificate = draw(st.sampled_from(["colliding", "free", "open", ""]))
+    certificate = draw(st.sampled_from(CERTIFICATES))
     return Contact(
         certificate,
         body,
@@ -90,14 +92,21 @@ def a_contact(draw: st.DrawFn, rng: np.random.Generator, body: Body) -> Contact:
     )
 
 
+def numbers_of(
+    rng: np.random.Generator,
+) -> tuple[Callable[[], NDArray[np.float64]], Callable[[], float]]:
+    """Return what draws vectors (3,), and what draws numbers."""
+    return lambda: rng.normal(size=3), lambda: float(rng.normal())
+
+
 def a_patch(rng: np.random.Generator) -> Patch:
-    vector, number = lambda: rng.normal(size=3), rng.normal
+    vector, number = numbers_of(rng)
     return Patch(vector(), vector(), (number(), number()), vector(), vector(), 3, 2**40)
 
 
 def a_finding(draw: st.DrawFn, rng: np.random.Generator, body: Body) -> Finding:
     """Return a finding in which every number differs from every other, and parts are missing."""
-    number, vector = rng.normal, lambda: rng.normal(size=3)
+    vector, number = numbers_of(rng)
     there = {part for part in PARTS if draw(st.booleans())}
     clearance = Clearance(number(), number(), vector(), vector(), number(), number())
     first = FirstContact(number(), number(), vector(), "outline lost")
@@ -151,7 +160,7 @@ def frame_results(draw: st.DrawFn, n_objects: int = 2) -> list[FrameResult]:
             a_finding(draw, rng, body) for body in BODIES[: 0 if reason else n_objects]
         )
         stage_s = dict(zip(STAGES, rng.uniform(size=len(STAGES)).tolist(), strict=True))
-        state = draw(st.sampled_from(["unread", "contradictory"])) if reason else "evaluated"
+        state = draw(st.sampled_from(UNREAD)) if reason else "evaluated"
         rests_on = draw(st.sampled_from(["", "left saw nothing"]))
         cameras = tuple(
             CameraFrame(

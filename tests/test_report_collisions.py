@@ -122,7 +122,7 @@ def test_one_mesh_of_two_objects_stands_in_the_file_once(run, tmp_path: Path) ->
         assert one.attrs["sha256"] == two.attrs["sha256"]
         moved_m = two["placement"][0] - one["placement"][0]
         np.testing.assert_allclose(
-            moved_m, [[0, 0, 0, 0], [0, 0, 0, 0.5], [0, 0, 0, 0]], atol=1e-15
+            moved_m, np.array([[0, 0, 0, 0], [0, 0, 0, 0.5], [0, 0, 0, 0]]), atol=1e-15
         )
         assert len(file["hybridve/meshes"]) == 1
 

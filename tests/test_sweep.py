@@ -8,9 +8,8 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -162,11 +161,14 @@ def test_distances_are_those_of_brute_force(viewport: int) -> None:
     (body,) = make_rows([one], (2,), 1.0)[0].bodies
     longest_m = np.sqrt(2) * 2 * half_m
     u = int(np.ceil(longest_m / outcome.truth.spacing_m) + 1)
-    of_witnesses, of_samples, missed = [], [], 0
+    of_witnesses: list[NDArray[np.float64]] = []
+    of_samples: list[NDArray[np.float64]] = []
+    missed = 0
     for hull in hulls:
         certificates = certify_by_samples(hull, body.triangles, 0.01)
         witnesses = certificates.witness_world[certificates.verdict == COLLIDING]
-        truth, reported = [], []
+        truth: list[NDArray[np.float64]] = []
+        reported: list[NDArray[np.float64]] = []
         for triangle in corners:
             for viewports, found in ((u, truth), (viewport, reported)):
                 grid = [(i, j) for j in range(viewports) for i in range(viewports - j)]
@@ -251,7 +253,7 @@ class Logged:
     def close(self) -> None:
         self._log.append((self.name, 0, None, threading.get_ident()))
 
-    def __enter__(self) -> "Logged":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -349,7 +351,9 @@ def test_an_engine_whose_device_fails_is_left_out_if_that_is_allowed() -> None:
     log: list[Any] = []
     told: list[tuple[str, str]] = []
     hulls = [ball_hull((0.0, 0.0, 0.0))]
-    broken = partial(Broken, "broken", log, Clock())
+
+    def broken() -> Engine:
+        return Broken("broken", log, Clock())
 
     outcome = sweep_of(
         [LARGE],

@@ -120,9 +120,8 @@ def test_board_corners_lie_where_the_lens_puts_them(
     camera = truth.cameras[camera_index]
     files = session.cameras[camera_index]
     assert session.target is not None
-    board = Chessboard(
-        session.target.columns, session.target.rows, session.target.square_mm / 1000.0
-    )
+    assert session.target.unit_m is not None
+    board = Chessboard(session.target.columns, session.target.rows, session.target.unit_m)
     assert files.intrinsics is not None
     assert files.extrinsics is not None
     poses = truth.cam_from_board[camera.name]
@@ -225,7 +224,8 @@ def test_shadows_lie_on_the_floor_where_cameras_see_it() -> None:
         lookup = shadow_lookup(make_view(camera), stage.room)
 
         places = (pixels - 0.5).astype(np.float32)[:, None]  # OpenCV's convention
-        found = [cv2.remap(part, places, None, cv2.INTER_LINEAR)[:, 0] for part in lookup]
+        nothing = np.zeros(0)  # both coordinates are in the first map
+        found = [cv2.remap(part, places, nothing, cv2.INTER_LINEAR)[:, 0] for part in lookup]
         # Remap interpolates at 1/32 pixel, and a pixel is up to two texels long on the floor.
         np.testing.assert_allclose(np.stack(found, axis=1), expected, atol=0.1)
 
@@ -342,9 +342,8 @@ def test_the_hull_of_the_true_silhouettes_touches_what_the_true_shapes_touch(
         for lens, camera in zip(lenses, truth.cameras, strict=True):
             assert lens.map_x is not None
             assert lens.map_y is not None
-            straight.append(
-                cv2.remap(masks[camera.name], lens.map_x, lens.map_y, cv2.INTER_NEAREST)
-            )
+            moved = cv2.remap(masks[camera.name], lens.map_x, lens.map_y, cv2.INTER_NEAREST)
+            straight.append(np.asarray(moved, np.uint8))
         hull = make_hull(views, straight)
         for thing in scene.objects:
             found = truth.objects[thing.name]

@@ -66,7 +66,7 @@ def test_a_ball_that_moves_evenly_touches_when_the_way_is_used_up(n_frames: int)
 def test_each_entry_is_found_and_leaving_is_none() -> None:
     # In and out four times between two frames; it rests inside at neither.
     def x_at(moment: float) -> float:
-        return 0.1 + RADIUS_M + 0.02 * np.cos(8.0 * np.pi * moment) + 0.01
+        return float(0.1 + RADIUS_M + 0.02 * np.cos(8.0 * np.pi * moment) + 0.01)
 
     entries = entries_of(moving_ball(x_at), 2)
 

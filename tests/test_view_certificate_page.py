@@ -15,6 +15,7 @@ from helpers.boards import LENSES, look_at, make_camera, ring
 from helpers.records import make_opinion, make_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.quiver import Quiver
@@ -434,7 +435,8 @@ def test_many_residuals_are_drawn_as_their_means() -> None:
 
 def arrows_of(figure: Figure) -> dict[str, Quiver]:
     found = [one for one in figure.axes[1].collections if isinstance(one, Quiver)]
-    return {"orange" if one.get_facecolor()[0][0] > 0.5 else "blue": one for one in found}
+    red = [np.atleast_2d(to_rgba_array(one.get_facecolor()))[0, 0] for one in found]
+    return {"orange" if r > 0.5 else "blue": one for r, one in zip(red, found, strict=True)}
 
 
 @pytest.mark.slow
@@ -455,7 +457,7 @@ def test_arrows_are_as_long_as_is_said_and_patterns_stand_out(
     for one in arrows.values():
         assert one.scale == pytest.approx(1.0 / float(said[1]))
         assert one.angles == one.scale_units == "xy"
-    orange, blue = arrows["orange"].XY, arrows["blue"].XY
+    orange, blue = (np.asarray(arrows[colour].XY) for colour in ("orange", "blue"))
     assert (orange[:, 0] < 320.0).mean() > 0.95
     assert (blue[:, 0] > 320.0 - 40.0).mean() > 0.95
     assert set(arrows_of(draw_camera(rig, 0, noise, NOISE_PX, volume))) == {"blue"}

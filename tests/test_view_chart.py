@@ -11,6 +11,7 @@ from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.text import Annotation
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
@@ -100,7 +101,9 @@ def test_what_was_not_measured_or_is_nought_is_labelled_where_it_was_predicted(
     write_chart(tmp_path / "chart.png", [nothing], "accuracy", title="", note="nothing collides")
 
     figure = draw_chart([nothing], "accuracy", title="", note="nothing collides")
-    heights = [text.xy[1] for text in figure.axes[0].texts]
+    notes = [text for text in figure.axes[0].texts if isinstance(text, Annotation)]
+    assert len(notes) == len(figure.axes[0].texts)
+    heights = [text.xy[1] for text in notes]
     assert heights == nothing.predicted_mm[:3].tolist()
 
 

@@ -23,6 +23,7 @@ from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.choose import open_engine
+from hybridve.hull.query.engine import EngineName
 
 SCENE = Path(__file__).parent.parent.parent / "data" / "horseman" / "scene.toml"
 
@@ -56,7 +57,11 @@ def subdivided(part: SceneObject, times: int) -> SceneObject:
 )
 @pytest.mark.smallest(engine="native", times=0)
 def bench_detect_horseman(
-    benchmark: Any, horseman: tuple[Session, Rig], frames: FrameRange, engine: str, times: int
+    benchmark: Any,
+    horseman: tuple[Session, Rig],
+    frames: FrameRange,
+    engine: EngineName,
+    times: int,
 ) -> None:
     cv2.setNumThreads(1)
     session, rig = horseman

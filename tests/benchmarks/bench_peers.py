@@ -139,7 +139,9 @@ def compare(n_cameras: int, lens: str, n_frames: int, n_seeds: int) -> list[dict
         f"{head}; load {os.getloadavg()[0]:.1f}\n"
         f"  {'least':12s}{'':32s} place {place_mm:8.3f} mm  turn {turn_mrad:8.3f} mrad\n"
     )
-    rows = [what | {"peer": "least", "place_mm": place_mm, "turn_mrad": turn_mrad}]
+    rows: list[dict[str, Any]] = [
+        what | {"peer": "least", "place_mm": place_mm, "turn_mrad": turn_mrad}
+    ]
     for name in PEERS:
         if name in found:
             rows.append(what | {"peer": name} | summary(found[name]))
@@ -199,7 +201,8 @@ def by_opencv(scene: Scene, observations: list[Observations]) -> Result:
     seen = np.isfinite(pixels).all(axis=(2, 3))
     corners = np.where(np.isfinite(pixels), pixels, 0.0).astype(np.float32)
     start, cpu_start = time.perf_counter(), time.process_time()
-    _, matrices, distortions, rotations, translations = cv2.calibrateMultiview(
+    calibrate: Any = cv2.calibrateMultiview  # whose types leave optional arguments out
+    _, matrices, distortions, rotations, translations = calibrate(
         [BOARD.points_board.astype(np.float32)] * pixels.shape[1],
         [list(own) for own in corners],
         [observed.size_px for observed in observations],

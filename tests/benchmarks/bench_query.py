@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.compiled import source_of
 from helpers.hulls import ball_hull, look_at, projection, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
@@ -197,13 +198,13 @@ def bench_work(
             return _of(*given)
 
         monkeypatch.setattr(rectangles, name, count)
-    monkeypatch.setattr(clusters, "open_nodes", rectangles.open_nodes.py_func)
+    monkeypatch.setattr(clusters, "open_nodes", source_of(rectangles.open_nodes))
     for _ in range(2):  # clusters are made for the second frame
         asked.update(clusters=0, triangles=0)
         hull = next_hull()
         frame = hull.frame
         shares = clusters.make_shares(hull, frame, mesh, threads)
-        left = [rectangles.survivors.py_func(*share, frame) for share in shares]
+        left = [source_of(rectangles.survivors)(*share, frame) for share in shares]
     sampled = sum(int(part.is_open.any(axis=1).sum()) for part in left)
     benchmark.extra_info.update(asked, sampled=sampled)
     benchmark.pedantic(lambda: None, rounds=1)

@@ -106,12 +106,17 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
             f"near {wrong[name][1].sum()}, on {(wrong[name][1] > 0).sum()}; "
             f"{1e6 * spent_s[name] / n_points:.2f} us a point"
         )
-    told = {"parts": len(parts), "points": n_points, "near": n_near, "judged_exactly": n_rational}
+    measured: dict[str, float] = {
+        "parts": len(parts),
+        "points": n_points,
+        "near": n_near,
+        "judged_exactly": n_rational,
+    }
     for name in names:
-        told[f"{name}.wrong"] = int(wrong[name].sum())
-        told[f"{name}.wrong_far"] = int(wrong[name][0].sum())
-        told[f"{name}.point_us"] = 1e6 * spent_s[name] / n_points
-    return told
+        measured[f"{name}.wrong"] = int(wrong[name].sum())
+        measured[f"{name}.wrong_far"] = int(wrong[name][0].sum())
+        measured[f"{name}.point_us"] = 1e6 * spent_s[name] / n_points
+    return measured
 
 
 def _points(

@@ -79,17 +79,18 @@ def _opencv(n_threads: int) -> Work:
 
 
 def _open3d() -> Work:
-    import open3d
+    from open3d import core, t
 
+    tensor: Any = core.Tensor  # whose types leave arrays out
     mesh = sphere_mesh(20_000, 0.5)
-    scene = open3d.t.geometry.RaycastingScene()
+    scene = t.geometry.RaycastingScene()
     scene.add_triangles(
-        open3d.core.Tensor(mesh.vertices_world.astype(np.float32)),
-        open3d.core.Tensor(mesh.faces.astype(np.uint32)),
+        tensor(mesh.vertices_world.astype(np.float32)),
+        tensor(mesh.faces.astype(np.uint32)),
     )
     directions = np.random.default_rng(0).normal(size=(4_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    points = open3d.core.Tensor((0.51 * directions).astype(np.float32))
+    points = tensor((0.51 * directions).astype(np.float32))
     return lambda: scene.compute_distance(points)
 
 

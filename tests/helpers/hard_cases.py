@@ -9,6 +9,7 @@ truth is that of the other, so that nothing which the likeness rounds away can g
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ MIDDLE = np.array([0.021, 0.033, 0.013])
 
 def beside(x: float, y: float, z: float) -> NDArray[np.float64]:
     """Return a point beside the middle, (3,)."""
-    return MIDDLE + np.array([x, y, z])
+    return np.asarray(MIDDLE + np.array([x, y, z]))
 
 
 Inside = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
@@ -122,7 +123,7 @@ class Scene:
 
 
 def likened(
-    scene: Scene, unit: float = 1.0, shift: NDArray[np.float64] | None = None, **changes: object
+    scene: Scene, unit: float = 1.0, shift: NDArray[np.float64] | None = None, **changes: Any
 ) -> Scene:
     """Return a scene in another unit (metres of the first a unit) and elsewhere."""
     shift = np.zeros(3) if shift is None else shift
@@ -215,7 +216,7 @@ def boxed_masks(
 
 
 def room(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32] | None = None, **changes: object
+    vertices: NDArray[np.float64], faces: NDArray[np.int32] | None = None, **changes: Any
 ) -> Scene:
     """Return the plain scene: four cameras, rectangles for silhouettes, and a mesh."""
     matrices, sizes_px = ring()
@@ -271,7 +272,7 @@ def camera_center(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 def seen_by(
     matrices: list[NDArray[np.float64]] | NDArray[np.float64],
     size_px: tuple[int, int] = (160, 120),
-    **changes: object,
+    **changes: Any,
 ) -> Scene:
     """Return other cameras before the plain scene's silhouettes and scattered triangles."""
     matrices = np.array(matrices)
@@ -700,12 +701,12 @@ def recorded_ball(
     """Return the recorded silhouette of a ball: pixels whose centre's ray meets it."""
     x, y = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
     rays = cam_from_img(camera, np.stack([x.ravel(), y.ravel()], axis=1))
-    exists = np.isfinite(rays).all(axis=1)
+    exists = np.asarray(np.isfinite(rays).all(axis=1))
     rays = np.column_stack([np.where(exists[:, None], rays, 0.0), np.ones(len(rays))])
     to_ball = camera.cam_from_world[:, :3] @ center + camera.cam_from_world[:, 3]
     along = rays @ to_ball / np.linalg.norm(rays, axis=1)
     on_ball = (along > 0) & (to_ball @ to_ball - along**2 < radius_m**2) & exists
-    return on_ball.reshape(x.shape).astype(np.uint8)
+    return np.asarray(on_ball).reshape(x.shape).astype(np.uint8)
 
 
 def told_by_recorded(
@@ -752,11 +753,12 @@ def told_by_recorded(
     return tell
 
 
-def bent(cameras: list[Camera], unseen: Unseen, least: int, **changes: object) -> Scene:
+def bent(cameras: list[Camera], unseen: Unseen, least: int, **changes: Any) -> Scene:
     """Return a ball before bent lenses, freed of distortion as recordings are."""
     cameras = [replace(camera, name=f"cam{k}") for k, camera in enumerate(cameras)]
     recorded = [recorded_ball(camera, MIDDLE, 0.15) for camera in cameras]
-    session = SimpleNamespace(cameras=cameras, unseen=unseen, min_cameras=least)
+    # What of a session is asked for here.
+    session: Any = SimpleNamespace(cameras=cameras, unseen=unseen, min_cameras=least)
     views, lenses = rig_views(session, Rig(tuple(cameras)))
     scene = Scene(
         views.img_from_local,

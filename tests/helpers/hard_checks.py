@@ -106,8 +106,10 @@ class Tools:
 
     def close(self) -> None:
         """Release all."""
-        for tool in (*self._engines.values(), *self._certifiers.values()):
-            tool.close()
+        for engine in self._engines.values():
+            engine.close()
+        for certifier in self._certifiers.values():
+            certifier.close()
         self._engines.clear()
         self._certifiers.clear()
 
@@ -363,7 +365,9 @@ def _check_measured(one: Built, meter: ClearanceMeter, apart: NDArray[np.float64
         at = exact.contains(one.hull, found.on_hull_world[None])
         assert at.inside[0], "the point of the hull is not in it"
         away_m = exact.distance(found.on_hull_world, vertices, scene.faces)
-        is_in = is_solid and bool(scene.is_inside((found.on_hull_world - shift)[None])[0])
+        is_in = scene.is_inside is not None and bool(
+            scene.is_inside((found.on_hull_world - shift)[None])[0]
+        )
         said_m = found.depth_lower_m if is_in else found.upper_m
         rounding = max(length, 4 * np.spacing(np.abs(vertices).max()))
         # The bound is wider than the point's distance by what that may be off.
@@ -373,7 +377,7 @@ def _check_measured(one: Built, meter: ClearanceMeter, apart: NDArray[np.float64
         assert on_m <= rounding, f"the point of the object is {on_m} m off it"
     for point in _points_of_hull(one):
         away_m = exact.distance(point, vertices, scene.faces)
-        if is_solid and scene.is_inside((point - shift)[None])[0]:
+        if scene.is_inside is not None and scene.is_inside((point - shift)[None])[0]:
             away_m = -away_m
         assert away_m >= lowest_m - max(length, 4 * np.spacing(np.abs(vertices).max())), (
             f"a point of the hull is {away_m} m away, said to be {lowest_m} at least"

@@ -4,6 +4,7 @@ Nothing here uses the code under test beyond building its inputs and projecting 
 """
 
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +157,7 @@ def random_views(
     Where they may abstain, half of the rigs have cameras that did not record all of their images,
     unless without `gaps`.
     """
-    sizes, matrices = [], []
+    sizes, projections = [], []
     for _ in range(n_cameras):
         width, height = rng.integers(8, largest_px, 2)
         direction = rng.normal(size=3)
@@ -165,8 +166,8 @@ def random_views(
         matrix = projection(pose, rng.uniform(0.6, 2.5) * max(width, height), width, height)
         matrix *= rng.uniform(0.1, 10.0)  # a projection has no scale
         sizes.append((width, height))
-        matrices.append(matrix)
-    matrices = np.array(matrices)
+        projections.append(matrix)
+    matrices = np.array(projections)
     if origin_world is not None:
         matrices[:, :, 3] -= matrices[:, :, :3] @ origin_world
     names = tuple(f"cam{k}" for k in range(n_cameras))
@@ -203,6 +204,9 @@ def large_views(rng: np.random.Generator) -> Views:
         matrices.append(projection(pose, focal_px, 1600, 1200))
     return make_views(tuple("abcd"), np.array([[1600, 1200]] * 4), np.array(matrices))
 
+
+#: What a pixel that was not recorded may stand for.
+UNSEEN: tuple[Unseen, ...] = get_args(Unseen)
 
 #: Silhouettes that leave something of the hull, and those that leave (next to) nothing.
 MASK_KINDS = ("blobs", "holes", "noise", "half", "full")
@@ -273,7 +277,8 @@ def random_corners(rng: np.random.Generator, views: Views, kind: str) -> NDArray
     if kind == "large":
         return around + 0.5 * shape
     if kind == "sliver":  # aspect 1e6
-        return around + np.array([0.3 * shape[0], -0.3 * shape[0], 3e-7 * shape[1]])
+        corners = [0.3 * shape[0], -0.3 * shape[0], 3e-7 * shape[1]]
+        return np.asarray(around + np.array(corners))
     if kind == "flat":  # no area: three points on a line
         return around + 0.3 * np.array([shape[0], -shape[0], rng.uniform(-1, 1) * shape[0]])
     if kind == "point":
@@ -283,11 +288,11 @@ def random_corners(rng: np.random.Generator, views: Views, kind: str) -> NDArray
     if kind == "huge":
         return around + 100.0 * shape
     if kind == "behind":
-        return camera - forward * rng.uniform(0.5, 3.0) + 0.2 * shape
+        return np.asarray(camera - forward * rng.uniform(0.5, 3.0) + 0.2 * shape)
     if kind == "through camera":
         return np.array([camera, around, around + 0.3 * shape[0]])
     assert kind == "crossing"  # the plane through the camera, beside its image
-    return camera + np.array([forward, -forward, 0.5 * forward]) + 0.3 * shape
+    return np.asarray(camera + np.array([forward, -forward, 0.5 * forward]) + 0.3 * shape)
 
 
 def soup(

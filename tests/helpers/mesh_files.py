@@ -236,6 +236,7 @@ def _fbx_value(value: Any, packed: bool) -> bytes:
 
 def _fbx_node(node: tuple[Any, ...], place: int, lengths: str, packed: bool) -> bytes:
     name, values, children = node
+    label: bytes = name.encode()
     data = b"".join(_fbx_value(value, packed) for value in values)
     head = struct.calcsize(lengths) + len(name)
     body = b""
@@ -244,9 +245,8 @@ def _fbx_node(node: tuple[Any, ...], place: int, lengths: str, packed: bool) -> 
     if children:
         body += b"\0" * struct.calcsize(lengths)
     end = place + head + len(data) + len(body)
-    return (
-        struct.pack(lengths, end, len(values), len(data), len(name)) + name.encode() + data + body
-    )
+    header = struct.pack(lengths, end, len(values), len(data), len(name))
+    return header + label + data + body
 
 
 def _binary_fbx(

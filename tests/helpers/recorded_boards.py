@@ -125,15 +125,15 @@ def record(
         sightings: list[Sighting] = []
         views: dict[tuple[str, int], Pose] = {}
         pixels_of: dict[tuple[str, int], NDArray[np.float64]] = {}
-        for image, instant, b, world_from_board in wanted:
+        for image, moment, b, world_from_board in wanted:
             pixels = see(camera, world_from_board, boards[b])
             if pixels is None:
                 continue
-            look = turns(number, instant) if turns and instant is not None else 0
+            look = turns(number, moment) if turns and moment is not None else 0
             noise = rng.normal(0.0, 1.0, pixels.shape) * noise_px
             pixels = (pixels + noise)[boards[b].looks[look]]
-            sightings.append(Sighting(image, instant, b, pixels))
-            if is_still and instant is not None:
+            sightings.append(Sighting(image, moment, b, pixels))
+            if is_still and moment is not None:
                 continue  # a lens is not fitted to a board that lies still
             pose = compose(camera.cam_from_world, world_from_board)
             pose = compose(pose, boards[b].board_from_turned(look))

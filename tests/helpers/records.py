@@ -16,7 +16,14 @@ from hybridve.calib.record import (
     StillsRecord,
     WorldRecord,
 )
+from hybridve.calib.rig import Rig
 from hybridve.calib.verdict import RigCheck
+
+
+def record_of(rig: Rig) -> CalibrationRecord:
+    """Return how a rig of ours came about."""
+    assert isinstance(rig.provenance, CalibrationRecord)
+    return rig.provenance
 
 
 def make_camera_record(

@@ -143,7 +143,7 @@ def polyhedron_lines(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     lines = np.column_stack([normals, -(normals * corners).sum(axis=1)])
     middle = np.append(corners.mean(axis=0), 1.0)
-    return lines * -np.sign(lines @ middle)[:, None]
+    return np.asarray(lines * -np.sign(lines @ middle)[:, None])
 
 
 def polyhedron_masks(views: Views, vertices_world: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
@@ -208,13 +208,13 @@ def cylinder_vertices(
     angle = np.arange(n_sides) * (2 * np.pi / n_sides)
     rim = np.column_stack([radius_m * np.cos(angle), radius_m * np.sin(angle), 0 * angle])
     ends = np.array([[0, 0, half_length_m], [0, 0, -half_length_m]])
-    return (rim + ends[:, None]).reshape(-1, 3) @ rotation.T + center_world
+    return np.asarray((rim + ends[:, None]).reshape(-1, 3) @ rotation.T + center_world)
 
 
 def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
     """Return a rotation matrix (3, 3)."""
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return rotation * np.sign(np.linalg.det(rotation))
+    return np.asarray(rotation * np.sign(np.linalg.det(rotation)))
 
 
 def random_unit(rng: np.random.Generator) -> NDArray[np.float64]:

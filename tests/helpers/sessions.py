@@ -30,7 +30,7 @@ def ring_matrix(camera: int, n_cameras: int) -> NDArray[np.float64]:
     right /= np.linalg.norm(right)
     rotation = np.array([right, np.cross(forward, right), forward])
     pinhole = np.array([[FOCAL_PX, 0, SIZE_PX[0] / 2], [0, FOCAL_PX, SIZE_PX[1] / 2], [0, 0, 1.0]])
-    return pinhole @ np.column_stack([rotation, -rotation @ center])
+    return np.asarray(pinhole @ np.column_stack([rotation, -rotation @ center]))
 
 
 def ball_mask(matrix: NDArray[np.float64], center: NDArray[np.float64]) -> NDArray[np.uint8]:

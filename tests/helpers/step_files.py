@@ -1,6 +1,6 @@
 """STEP files of boxes and cylinders, written entity by entity, so that their truth is known."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -27,17 +27,17 @@ class StepWriter:
             f"DATA;\n{data}\nENDSEC;\nEND-ISO-10303-21;\n"
         )
 
-    def point(self, position: Sequence[float]) -> str:
+    def point(self, position: Iterable[float]) -> str:
         """Add a point."""
         x, y, z = (float(value) for value in position)
         return self(f"CARTESIAN_POINT('',({x!r},{y!r},{z!r}))")
 
-    def direction(self, direction: Sequence[float]) -> str:
+    def direction(self, direction: Iterable[float]) -> str:
         """Add a direction."""
         x, y, z = (float(value) for value in direction)
         return self(f"DIRECTION('',({x!r},{y!r},{z!r}))")
 
-    def axes(self, origin: Sequence[float], z: Vector = (0, 0, 1), x: Vector = (1, 0, 0)) -> str:
+    def axes(self, origin: Iterable[float], z: Vector = (0, 0, 1), x: Vector = (1, 0, 0)) -> str:
         """Add a frame."""
         return self(
             f"AXIS2_PLACEMENT_3D('',{self.point(origin)},{self.direction(z)},{self.direction(x)})"

@@ -57,7 +57,13 @@ def points_on_rays(
     """Return points (N, 3), world, of a camera's grown silhouette, most within the common view."""
     views = hull.views
     padded = cv2.copyMakeBorder(
-        hull.mask(camera), *[grown_px] * 4, borderType=cv2.BORDER_CONSTANT, value=0
+        hull.mask(camera),
+        grown_px,
+        grown_px,
+        grown_px,
+        grown_px,
+        borderType=cv2.BORDER_CONSTANT,
+        value=0,
     )
     grown = cv2.dilate(padded, np.ones((2 * grown_px + 1, 2 * grown_px + 1), np.uint8))
     rows, columns = np.nonzero(grown)
@@ -135,7 +141,8 @@ def test_growing_silhouettes_as_images_is_the_same(
     views = random_views(rng, n_cameras)
     masks = balls(views, (rng.uniform(-0.1, 0.1, 3), 0.05))
     masks[0] = shifted(masks[0], *rng.integers(-12, 12, 2).tolist())
-    grown = [cv2.dilate(mask, np.ones((2 * grown_px + 1,) * 2, np.uint8)) for mask in masks]
+    kernel = np.ones((2 * grown_px + 1,) * 2, np.uint8)
+    grown = [np.asarray(cv2.dilate(mask, kernel), np.uint8) for mask in masks]
     tolerance_px = np.full(n_cameras, grown_px)
     pencils = make_pencils(views)
 

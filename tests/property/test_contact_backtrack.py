@@ -43,7 +43,8 @@ def masks(draw: st.DrawFn) -> NDArray[np.uint8]:
     if kind in ("empty", "full"):
         return np.full((HEIGHT, WIDTH), kind == "full", np.uint8)
     if kind == "noise":
-        return (rng.random((HEIGHT, WIDTH)) < rng.choice([0.02, 0.5, 0.98])).astype(np.uint8)
+        share = rng.choice([0.02, 0.5, 0.98])
+        return np.asarray(rng.random((HEIGHT, WIDTH)) < share).astype(np.uint8)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     mask = np.zeros((HEIGHT, WIDTH), np.bool_)
     for _ in range(rng.integers(1, 5)):
@@ -198,7 +199,7 @@ def touching_fraction(
             touching = middle
         else:
             free = middle
-    return touching
+    return float(touching)
 
 
 # Not shrunk: an example takes a tenth of a second.

@@ -36,7 +36,7 @@ class Box:
         """Distances (N,) of points (N, 3) in closed form, negative inside."""
         beyond = np.abs((points - self.center) @ self.rotation) - self.half
         outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
-        return outside + np.minimum(beyond.max(axis=1), 0.0)
+        return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.contacts import contact_at
-from helpers.hulls import MASK_KINDS, random_masks, random_views
+from helpers.hulls import MASK_KINDS, UNSEEN, random_masks, random_views
 from helpers.response import camera_center, random_unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,7 +25,7 @@ def rays(draw: st.DrawFn) -> Ray:
     """Rigs of 1 to 6 cameras of unequal image size, and a ray: origin, unit direction."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     n_cameras = draw(st.integers(1, 6))
-    unseen = draw(st.sampled_from(["carve", "keep"]))
+    unseen = draw(st.sampled_from(UNSEEN))
     away = draw(st.sampled_from([0.0, 1.0, 1000.0]))
     views = random_views(
         rng, n_cameras, unseen, draw(st.integers(1, n_cameras)), 160, away * rng.normal(size=3)

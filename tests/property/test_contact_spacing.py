@@ -192,10 +192,10 @@ stretches = st.lists(
 def test_sets_of_stretches_are_what_their_points_are(
     first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> None:
-    points = np.arange(-25, 35) + 0.5  # no end is among them
+    points = np.arange(-25.0, 35.0) + 0.5  # no end is among them
 
     def holds(some: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return ((some[:, :1] <= points) & (points <= some[:, 1:])).any(axis=0)
+        return np.asarray(((some[:, :1] <= points) & (points <= some[:, 1:])).any(axis=0))
 
     one, other = union(first), union(second)
 

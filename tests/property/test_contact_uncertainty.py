@@ -73,7 +73,7 @@ def test_the_farthest_point_of_a_ray_is_bounded_closely(seed: int) -> None:
     direction = rng.normal(size=3)
     ends_m = np.sort(rng.uniform(0.0, 1.2, 2 * int(rng.integers(1, 4)))).reshape(-1, 2)
     ray = Ray(rng.uniform(-0.5, 0.5, 3), direction / np.linalg.norm(direction), ends_m)
-    within_m = np.linspace(*ends_m.T, 2001, axis=1).ravel()
+    within_m = np.linspace(ends_m[:, 0], ends_m[:, 1], 2001, axis=1).ravel()
 
     bound_m = farthest_on(meter(), ray, np.inf)
 

@@ -10,6 +10,7 @@ from helpers.hulls import (
     EMPTYING_MASK_KINDS,
     MASK_KINDS,
     TRIANGLE_KINDS,
+    UNSEEN,
     assert_same_samples,
     differences,
     is_in_order,
@@ -26,7 +27,7 @@ from hybridve.hull.query.compute import Compute
 from hybridve.hull.query.engine import Hits, Triangles
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import Reference
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull
 from hybridve.hull.query.stencil import Stencil
 
 examples = settings(
@@ -55,13 +56,14 @@ def stencil() -> Iterator[Stencil]:
 
 
 @st.composite
-def hulls(draw: st.DrawFn, min_cameras: int = 2, unseen: str | None = None) -> Hull:
+def hulls(draw: st.DrawFn, min_cameras: int = 2, unseen: Unseen | None = None) -> Hull:
     """Rigs of 2 to 20 cameras of unequal image size, with silhouettes of any kind."""
     n_cameras = draw(st.integers(min_cameras, 5) | st.integers(min_cameras, 20))
-    unseen = unseen or draw(st.sampled_from(["carve", "keep"]))
+    rules = st.sampled_from(UNSEEN)
+    rule = draw(rules) if unseen is None else unseen
     needed = draw(st.integers(1, n_cameras))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    views = random_views(rng, n_cameras, unseen, needed)
+    views = random_views(rng, n_cameras, rule, needed)
     kinds = rng.choice(MASK_KINDS, n_cameras).tolist()
     emptying = draw(st.none() | st.none() | st.none() | st.sampled_from(EMPTYING_MASK_KINDS))
     if emptying is not None:
@@ -71,7 +73,7 @@ def hulls(draw: st.DrawFn, min_cameras: int = 2, unseen: str | None = None) -> H
 
 @st.composite
 def scenes(
-    draw: st.DrawFn, min_cameras: int = 2, unseen: str | None = None
+    draw: st.DrawFn, min_cameras: int = 2, unseen: Unseen | None = None
 ) -> tuple[Hull, Triangles]:
     """A hull, and triangles of every difficult kind with viewports of their own."""
     hull = draw(hulls(min_cameras, unseen))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.hulls import EMPTYING_MASK_KINDS, MASK_KINDS, random_masks, random_views
+from helpers.hulls import EMPTYING_MASK_KINDS, MASK_KINDS, UNSEEN, random_masks, random_views
 from helpers.response import camera_center, random_unit
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -20,7 +20,7 @@ def rays(draw: st.DrawFn) -> Rays:
     """Rigs of 1 to 6 cameras of unequal image size, and rays: origins (R, 3), unit directions."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     n_cameras = draw(st.integers(1, 6))
-    unseen = draw(st.sampled_from(["carve", "keep"]))
+    unseen = draw(st.sampled_from(UNSEEN))
     views = random_views(rng, n_cameras, unseen, draw(st.integers(1, n_cameras)), 160)
     kinds = rng.choice(MASK_KINDS * 3 + EMPTYING_MASK_KINDS, n_cameras).tolist()
     hull = make_hull(views, random_masks(rng, views, kinds))

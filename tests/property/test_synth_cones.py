@@ -12,7 +12,7 @@ from hybridve.calib.pose import Pose, rotation_about_axes, transform
 from hybridve.hull.synth.cones import RESOLUTION_M, Surface, TrueHull
 from hybridve.hull.synth.meshes import box_mesh
 from hybridve.hull.synth.presets import PRESETS
-from hybridve.hull.synth.shapes import Ball, Box, Capsule, Cylinder
+from hybridve.hull.synth.shapes import Ball, Box, Capsule, Cylinder, Shape
 
 CAMERAS = PRESETS["boxes"].make_stage().cameras
 
@@ -69,7 +69,7 @@ def test_the_hull_holds_the_shapes_and_the_points_they_explain_together(
     offset: NDArray[np.float64],
 ) -> None:
     turned = np.column_stack([rotation_about_axes(rotate_deg), other])
-    shapes = (Ball(radius_m), Cylinder(2 * radius_m, radius_m))
+    shapes: tuple[Shape, ...] = (Ball(radius_m), Cylinder(2 * radius_m, radius_m))
     poses = (at(place), turned)
     point = place + offset
 
