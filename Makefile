@@ -12,6 +12,10 @@ BIN := .venv/bin
 # As many processes run as there are cores: threads of linear algebra in each would fight.
 pytest quick soak bench theory hard-cases: export OPENBLAS_NUM_THREADS = 1
 
+# Compiled modules are kept whatever the shell says: compiling them anew costs each process 5 s, and
+# each command that a test starts its share.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test check pytest quick soak bench theory hard-cases lock setup clean
 
 demo: setup

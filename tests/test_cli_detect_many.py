@@ -19,7 +19,7 @@ Run = Callable[..., int]
 AWAY = np.array([[-0.9, 0.0, 0.0], [-0.8, 0.0, 0.0]])
 INTO = np.array([[-0.5, 0.0, 0.0], [-0.2, 0.0, 0.0]])
 
-QUICK = ("--viewport", 6, "--no-doubt", "--no-progress")
+QUICK = ("--viewport", 6, "--clearance-mm", 5, "--no-doubt", "--no-progress")
 
 
 @pytest.fixture
