@@ -41,7 +41,6 @@ def full(views: Views) -> Hull:
     )
 
 
-@pytest.mark.slow
 def test_a_ring_that_looks_inward_has_a_common_view() -> None:
     views = ring_views()
     told = common_view(views)

@@ -36,7 +36,6 @@ def nothing(views: Views, camera: int) -> NDArray[np.uint8]:
     return np.zeros((height, width), np.uint8)
 
 
-@pytest.mark.slow
 def test_a_ball_that_all_see_is_agreed_on() -> None:
     views = ring()
     hull = make_hull(views, balls(views, HERE))

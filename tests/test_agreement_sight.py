@@ -26,7 +26,6 @@ def sees(views: Views, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
     return contains_points(make_hull(views, masks), points_world)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("x", "y", "expected"),
     [

@@ -290,7 +290,6 @@ def test_a_camera_bumped_by_5_mm_and_a_third_of_a_degree_is_named() -> None:
     assert np.median(turns_deg) == pytest.approx(BUMP_DEG, abs=0.1)
 
 
-@pytest.mark.slow
 def test_a_rig_is_not_accused_of_errors_that_it_states_itself() -> None:
     """The same rig, shaken: with a covariance that allows for it, and with one that does not."""
     rig = calibrated(0)
@@ -331,7 +330,6 @@ def test_several_bumped_cameras_are_named_with_how_far_they_moved() -> None:
     assert check.moved["cam4"].what == "pose"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("knows_its_errors", [True, False])
 @pytest.mark.parametrize("pair", [("cam1", "cam2"), ("cam1", "cam3"), ("cam3", "cam4")])
 def test_exchanged_cameras_are_named(pair: tuple[str, str], knows_its_errors: bool) -> None:
@@ -372,7 +370,6 @@ def test_a_zoom_is_told_from_a_move(n_cameras: int, knows_its_errors: bool, fact
     assert "another lens or zoom" in check.message
 
 
-@pytest.mark.slow
 def test_a_scale_beyond_the_stated_errors_is_told() -> None:
     rig = calibrated(3)
     assert rig.covariance is not None
@@ -395,7 +392,6 @@ def test_a_scale_beyond_the_stated_errors_is_told() -> None:
     assert unknown.is_trustworthy  # 5 % are allowed where errors are not known
 
 
-@pytest.mark.slow
 def test_the_order_of_cameras_and_sightings_does_not_matter() -> None:
     rig = calibrated(4)
     now = with_one(truth(), 2, bumped(truth()[2], 4, 20.0, 1.0))

@@ -89,6 +89,7 @@ def test_offsets_are_found_to_a_fraction_of_a_frame() -> None:
     assert not clocks.notes
 
 
+@pytest.mark.slow
 @settings(max_examples=4)
 @given(late=st.floats(-12.0, 12.0), other=st.floats(-12.0, 12.0))
 def test_any_offset_is_found(late: float, other: float) -> None:

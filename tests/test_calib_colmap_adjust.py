@@ -216,6 +216,7 @@ def test_it_says_nothing_on_its_own(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_the_answer_is_the_same_bits_for_any_number_of_threads() -> None:
     """In processes of their own: libraries look at their variables but once."""
     digests = set()

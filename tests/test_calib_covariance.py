@@ -94,7 +94,6 @@ def test_errors_are_as_large_as_the_covariance_says_in_every_direction() -> None
     assert np.sum(squares) / count == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / count) + 0.04)
 
 
-@pytest.mark.slow
 def test_points_are_placed_as_wrong_as_is_said() -> None:
     middle = BOARD.center_board
     points = middle + np.array([[0.0, 0.0, 0.1], [0.3, 0.1, 0.3], [-0.2, 0.2, 0.5]])

@@ -361,7 +361,6 @@ def assert_honest(
     assert worst_sigmas(calibration, certificate, true) < _CONFIDENTLY_WRONG
 
 
-@pytest.mark.slow
 def test_a_camera_upside_down_is_as_good_as_any() -> None:
     cameras = around()
     x, y, _ = LYING.center_board
@@ -398,7 +397,6 @@ def test_three_views_make_a_lens_that_is_as_unsure_as_it_says() -> None:
     assert two.place_std_m > 1.2 * one.place_std_m
 
 
-@pytest.mark.slow
 def test_a_board_in_a_corner_of_the_image_leaves_the_rest_unsure() -> None:
     camera = around()[1]
     poses = []
@@ -511,7 +509,6 @@ def test_of_two_cameras_the_mirrored_one_cannot_be_told() -> None:
     assert_refused("'cam2' or of 'cam1' seems to be mirrored", [CARRIED], [one, mirrored(other)])
 
 
-@pytest.mark.slow
 def test_a_mirrored_board_of_markers_on_the_floor_puts_its_camera_below() -> None:
     seen = lying()
     seen[1] = mirrored(seen[1], are_points_named=True)
@@ -519,7 +516,6 @@ def test_a_mirrored_board_of_markers_on_the_floor_puts_its_camera_below() -> Non
     assert_refused("'cam2' .*came out under the floor: is its picture mirrored", [LYING], seen)
 
 
-@pytest.mark.slow
 def test_a_camera_that_saw_another_board_is_doubted() -> None:
     camera = row_of_cameras(3, 0.25, "SIMPLE_PINHOLE")[1]
     seen = [replace(one, sightings=one.sightings[:6]) for one in carried()]

@@ -119,7 +119,6 @@ def test_fewer_than_three_pairs_are_a_mistake() -> None:
         solve_hand_eye([np.eye(3, 4)] * 2, [np.eye(3, 4)] * 2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_boards_seen_without_noise_give_the_mount_back(seed: int) -> None:
     walk = Walk(seed)
@@ -134,7 +133,6 @@ def test_boards_seen_without_noise_give_the_mount_back(seed: int) -> None:
     assert np.abs(about.covariance).max() < 1e-18
 
 
-@pytest.mark.slow
 def test_a_board_elsewhere_moves_the_trackers_world_and_not_the_offset() -> None:
     walk = Walk(0)
     world_from_board = some_pose(np.random.default_rng(5), 1.0)
@@ -145,7 +143,6 @@ def test_a_board_elsewhere_moves_the_trackers_world_and_not_the_offset() -> None
     assert apart(mount, Mount(walk.mount.cam_from_tracker, moved)) < 1e-9
 
 
-@pytest.mark.slow
 def test_two_boards_in_one_world_are_used_together_and_a_third_unknown_one_is_not() -> None:
     walk = Walk(1, 12)
     rng = np.random.default_rng(2)
@@ -167,7 +164,6 @@ def test_two_boards_in_one_world_are_used_together_and_a_third_unknown_one_is_no
     assert about.views == 12
 
 
-@pytest.mark.slow
 def test_the_order_of_pictures_does_not_matter() -> None:
     walk = Walk(3, noise_px=0.3, tracker_rad=0.002, tracker_m=0.001)
     order = np.random.default_rng(0).permutation(len(walk.sightings))
@@ -209,7 +205,6 @@ def test_errors_are_as_large_as_the_covariance_says(noise: dict[str, Any]) -> No
     assert 0.15 < float(np.mean(pose_squares)) < 1.4
 
 
-@pytest.mark.slow
 def test_wrong_poses_and_turned_over_boards_are_dropped_and_told() -> None:
     walk = Walk(4, noise_px=0.2)
     wrong = {**walk.tracked}
@@ -239,7 +234,6 @@ def test_corners_that_were_not_seen_do_not_count() -> None:
     assert about.dropped == {"0.png": "the board cannot be located"}
 
 
-@pytest.mark.slow
 def test_a_board_listed_the_other_way_round_is_listed_as_most_are() -> None:
     symmetric = Chessboard(8, 6, 0.1)
     assert len(symmetric.looks) == 2
@@ -321,7 +315,6 @@ def test_a_tracker_that_turns_about_one_axis_is_refused_and_the_axis_named() -> 
     assert "offset along that axis cannot be found" in said
 
 
-@pytest.mark.slow
 def test_a_stuck_tracker_is_refused_and_a_stuck_spell_left_out() -> None:
     walk = Walk(0)
     spell = {k: walk.tracked[min(k, 10) if k < 15 else k] for k in walk.tracked}

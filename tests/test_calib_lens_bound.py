@@ -403,7 +403,6 @@ def test_an_unknown_lens_is_refused_by_name() -> None:
         distorted("GOPRO", np.ones(4), one, one)
 
 
-@pytest.mark.slow
 def test_the_report_says_it_of_every_camera(run: Callable[..., int], tmp_path: Path) -> None:
     session = write_ball_session(tmp_path / "ball", np.zeros((1, 3)))
     scene = write_cube_scene(tmp_path / "scene", {"cube": (0.0, 0.0, 0.0)})

@@ -134,7 +134,6 @@ def test_the_choice_does_not_depend_on_the_order_of_sightings() -> None:
     np.testing.assert_array_equal(first.camera.params, turned.camera.params)
 
 
-@pytest.mark.slow
 def test_cameras_that_share_a_lens_choose_together() -> None:
     camera = make_camera("a", "OPENCV", np.eye(3, 4))
     seen = [noisy(camera, 12, 0.1, 1), noisy(replace(camera, name="b"), 12, 0.1, 2)]
@@ -146,7 +145,6 @@ def test_cameras_that_share_a_lens_choose_together() -> None:
     np.testing.assert_array_equal(first.camera.params, second.camera.params)
 
 
-@pytest.mark.slow
 def test_parallel_boards_choose_nothing() -> None:
     camera = make_camera("cam", "OPENCV", np.eye(3, 4))
     rng = np.random.default_rng(4)

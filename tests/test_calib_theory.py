@@ -73,6 +73,7 @@ def test_errors_are_as_large_as_each_rig_says() -> None:
     assert mean == pytest.approx(1.0, abs=four_deviations)
 
 
+@pytest.mark.slow
 def test_the_stated_covariance_is_the_bound() -> None:
     """Entry by entry, but for the noise, which each rig measures by itself."""
     bound = least_covariance(SCENE, NOISE_PX)
@@ -84,6 +85,7 @@ def test_the_stated_covariance_is_the_bound() -> None:
     np.testing.assert_allclose((stated - bound) / np.outer(deviations, deviations), 0.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_points_are_within_the_radius_stated_for_them() -> None:
     inside = np.array(
         [

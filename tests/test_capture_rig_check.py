@@ -343,7 +343,6 @@ def test_a_camera_turned_about_a_board_that_looks_the_same_then_is_refused(sessi
         load(session)
 
 
-@pytest.mark.slow
 def test_where_nothing_tells_how_cameras_are_turned_that_is_said_each_time(
     session: Path,
     run: Callable[..., int],

@@ -52,7 +52,6 @@ def write(path: Path, n_frames: int = 4) -> list[NDArray[np.uint8]]:
     return masks
 
 
-@pytest.mark.slow
 @_FEW
 @given(recording=recordings_of_masks(), stamp=st.text(st.characters(codec="utf-8"), max_size=20))
 def test_what_is_written_is_what_is_read(

@@ -54,6 +54,7 @@ def test_the_rig_is_found_to_a_few_millimetres(folder: Path) -> None:
         assert angle_between(found.cam_from_world, camera.cam_from_world) < 0.003
 
 
+@pytest.mark.slow
 def test_colmap_agrees_about_the_rig(folder: Path) -> None:
     record = read_rig(folder / "session" / "rig" / "rig.json").provenance
 

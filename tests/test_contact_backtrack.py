@@ -305,7 +305,6 @@ def test_samples_touch_after_the_surface_does_and_soon(
     np.testing.assert_allclose(sampled.point_world, certain.point_world, atol=0.02)
 
 
-@pytest.mark.slow
 def test_the_point_lies_amid_the_patch_of_first_contact(
     certifier: Certifier, engine: Native
 ) -> None:

@@ -166,7 +166,6 @@ def hulls(draw: st.DrawFn) -> Hull:
     return make_hull(views, random_masks(rng, views, rng.choice(MASK_KINDS, n_cameras).tolist()))
 
 
-@pytest.mark.slow
 @settings(max_examples=25)
 @given(hull=hulls(), seed=st.integers(0, 2**32 - 1))
 def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(

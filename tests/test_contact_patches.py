@@ -66,7 +66,6 @@ def found_in(hull: Hull, part: SceneObject) -> tuple[ClearanceMeter, Contact]:
     return meter, contact
 
 
-@pytest.mark.slow
 def test_two_balls_that_touch_one_plate_are_two_patches() -> None:
     hull, part = balls(looking_down(), CENTERS), plate(0.03)
     meter, contact = found_in(hull, part)

@@ -293,7 +293,6 @@ def without_others(views: Views, camera: int) -> Views:
     )
 
 
-@pytest.mark.slow
 def test_where_outlines_explain_nothing_the_clearance_is_measured_again() -> None:
     # One pixel of one camera: no outline has a direction there.
     views = ring_views(3)

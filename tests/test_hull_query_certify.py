@@ -118,6 +118,7 @@ def test_cells_decide_what_one_rectangle_does_not(certifier: Certifier) -> None:
     assert (verdict == COLLIDING).any()
 
 
+@pytest.mark.slow
 @examples
 @given(scene=scenes())
 def test_what_collides_has_a_witness_on_the_triangle(

@@ -43,6 +43,7 @@ def again(hull: Hull) -> Hull:
     return make_hull(hull.views, [hull.mask(camera) for camera in range(len(hull.views))])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_deep_trees")
 @settings(
     max_examples=60,

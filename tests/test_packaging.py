@@ -38,12 +38,14 @@ def wheel_names(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         return archive.namelist()
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_the_package_and_nothing_beside_it(wheel_names: list[str]) -> None:
     tops = {name.split("/")[0] for name in wheel_names}
 
     assert {top for top in tops if not top.endswith(".dist-info")} == {"hybridve"}
 
 
+@pytest.mark.slow
 def test_every_file_that_the_package_reads_is_in_the_wheel(wheel_names: list[str]) -> None:
     for folder in ("cli", "hull", "calib"):
         for pattern in ("*.py", "*.glsl", "*.jinja", "*.css", "py.typed"):

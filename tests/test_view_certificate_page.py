@@ -439,7 +439,6 @@ def arrows_of(figure: Figure) -> dict[str, Quiver]:
     return {"orange" if r > 0.5 else "blue": one for r, one in zip(red, found, strict=True)}
 
 
-@pytest.mark.slow
 def test_arrows_are_as_long_as_is_said_and_patterns_stand_out(
     two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume],
 ) -> None:

@@ -255,7 +255,6 @@ def test_winding_numbers_are_those_of_rational_arithmetic(seed: int) -> None:
     assert {-1, 0, 1, 2} <= numbers
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_sides_do_not_depend_on_the_points_before(seed: int) -> None:
     """Sides are taken over from point to point where no surface is between."""

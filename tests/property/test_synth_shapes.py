@@ -271,7 +271,6 @@ def test_a_ray_without_a_direction_meets_nothing(shape: Shape) -> None:
     assert shape.hit(np.array([0.0, 0.0, 2.0]), np.zeros((1, 3))).tolist() == [np.inf]
 
 
-@pytest.mark.slow
 @example(
     corners=[np.array([0.0, 1.0, 0.0])] * 3,
     first=(Ball(0.25), np.eye(3, 4)),
