@@ -224,8 +224,8 @@ def test_shadows_lie_on_the_floor_where_cameras_see_it() -> None:
         lookup = shadow_lookup(make_view(camera), stage.room)
 
         places = (pixels - 0.5).astype(np.float32)[:, None]  # OpenCV's convention
-        nothing = np.zeros(0)  # both coordinates are in the first map
-        found = [cv2.remap(part, places, nothing, cv2.INTER_LINEAR)[:, 0] for part in lookup]
+        x_px, y_px = places[..., 0], places[..., 1]
+        found = [cv2.remap(part, x_px, y_px, cv2.INTER_LINEAR)[:, 0] for part in lookup]
         # Remap interpolates at 1/32 pixel, and a pixel is up to two texels long on the floor.
         np.testing.assert_allclose(np.stack(found, axis=1), expected, atol=0.1)
 
