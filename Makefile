@@ -2,6 +2,7 @@
 # make test    everything that must hold: style, types, import contracts, tests
 # make quick   under a minute of the tests: of each one that is quick the first case
 # make coverage  what share of the lines the tests run; compiled loops are not counted
+# make oldest  the quick tests with the oldest dependencies that pyproject.toml allows
 # make soak    the property tests with new examples: RUNS=10 times, SEED=1 and up, TESTS=some files
 # make bench   the benchmarks at full size, into tests/benchmarks/results.json; ONLY="bench_query" some
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
@@ -11,13 +12,13 @@
 BIN := .venv/bin
 
 # As many processes run as there are cores: threads of linear algebra in each would fight.
-pytest quick coverage soak bench theory hard-cases: export OPENBLAS_NUM_THREADS = 1
+pytest quick coverage oldest soak bench theory hard-cases: export OPENBLAS_NUM_THREADS = 1
 
 # Compiled modules are kept whatever the shell says: compiling them anew costs each process 5 s, and
 # each command that a test starts its share.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check pytest quick coverage soak bench theory hard-cases lock setup clean
+.PHONY: demo test check pytest quick coverage oldest soak bench theory hard-cases lock setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -43,6 +44,9 @@ coverage: setup
 	$(BIN)/pytest -q -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable \
 		--cov --cov-report=term
 	@printf 'coverage: %s %% of the lines\n' "$$($(BIN)/coverage report --format=total)"
+
+oldest: setup
+	@bash .ci/oldest
 
 # New examples, a seed a round: RUNS rounds (1), seeds from SEED up (drawn), of the tests in TESTS
 # (all that draw). The first round that is red ends it, and says how to repeat just that round.
