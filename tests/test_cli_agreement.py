@@ -190,7 +190,7 @@ def test_a_small_bump_widens_what_holds_at_95_percent(
     folder = tmp_path / "bumped"
     shutil.copytree(session.parent, folder)
     for picture in (folder / "cam3").glob("*.png"):
-        image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
+        image = np.asarray(cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE))
         cv2.imwrite(str(picture), np.roll(image, 3, axis=1))
     found = []
     for where in (session.parent, folder):

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -23,8 +24,8 @@ BUMPED, SHIFT_PX = 2, 20
 SINCE = 3
 
 
-def bump(**changes: object) -> NamedCause:
-    known = {
+def bump(**changes: Any) -> NamedCause:
+    known: dict[str, Any] = {
         "kind": "bumped",
         "cameras": (f"cam{BUMPED}",),
         "first_frame": SINCE,
@@ -116,12 +117,12 @@ def test_a_report_chooses_the_middle_of_the_worst_cause(
 
     path = draw(run, session, scene, "--report", report)
     assert capsys.readouterr().out == f"{path}: frame 4\n"
-    named = cv2.imread(str(path))
+    named = np.asarray(cv2.imread(str(path)))
     draw(run, session, scene, "--report", report, "--frame", 1)
     assert capsys.readouterr().out == f"{path}: frame 1\n"
 
     draw(run, session, scene, "--frame", 4)
-    unnamed = cv2.imread(str(path))
+    unnamed = np.asarray(cv2.imread(str(path)))
     assert (named != unnamed).any()
     differs = np.argwhere((named != unnamed).any(axis=2))
     middle = np.array(named.shape[:2]) / 2

@@ -21,7 +21,7 @@ from hybridve.hull.contact.uncertainty import Doubt
 from hybridve.hull.curves import write_curves
 from hybridve.hull.report import machine
 from hybridve.hull.report.read import read_report
-from hybridve.hull.report.schema import FrameResult, ReportHeader, State
+from hybridve.hull.report.schema import FrameResult, Part, ReportHeader, State
 from hybridve.hull.report.summarize import failing, summarize
 from hybridve.hull.report.write import ReportWriter
 
@@ -154,7 +154,7 @@ def test_the_summary_counts_bounds_dates_and_names(path: Path) -> None:
 
 
 def only(
-    frames: list[Finding], path: Path, required_m: float = 0.0, parts: frozenset[str] = frozenset()
+    frames: list[Finding], path: Path, required_m: float = 0.0, parts: frozenset[Part] = frozenset()
 ) -> dict[str, Any]:
     header = ReportHeader(
         run=machine.Run("", "", {}, ""),
@@ -163,7 +163,7 @@ def only(
         rig={},
         engine="",
         renderer="",
-        parts=frozenset({"clearance", "doubt"}) | parts,
+        parts=frozenset({"clearance", "doubt", *parts}),
         cameras=("cam1", "cam2"),
         meshes=(stored_mesh(FREE.body),),
     )
@@ -191,7 +191,7 @@ def test_the_nearest_frame_and_the_least_at_95_percent_may_be_different_ones(
 
 
 @pytest.mark.parametrize("parts", [{"response"}, {"response", "recovery"}])
-def test_a_shift_that_nobody_asked_for_is_not_there(tmp_path: Path, parts: set[str]) -> None:
+def test_a_shift_that_nobody_asked_for_is_not_there(tmp_path: Path, parts: set[Part]) -> None:
     no_exit = deep(6.0, response=LOST, recovery=Recovery("", np.nan, np.nan))
 
     (found,) = only([no_exit], tmp_path / "r.h5", parts=frozenset(parts))["objects"]

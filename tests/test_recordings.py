@@ -135,7 +135,7 @@ def test_a_camera_of_horseman_that_is_turned_is_found_to_be(
     assert camera.extrinsics is not None
     assert camera.background is not None
     then, empty = (
-        cv2.cvtColor(source.first(), cv2.COLOR_BGR2GRAY)
+        np.asarray(cv2.cvtColor(source.first(), cv2.COLOR_BGR2GRAY), np.uint8)
         for source in (camera.extrinsics, camera.background)
     )
     turn = np.radians(turn_deg) * np.array([0.6, -0.7, 0.39])

@@ -290,8 +290,8 @@ def test_outlines_are_read_from_the_parts_as_they_were_taken_in(
             np.testing.assert_array_equal(outline.marks, camera.outline.marks)
             assert outline.is_inverse == camera.outline.is_inverse
     with h5py.File(tmp_path / "report.h5") as file:
-        for number, camera in enumerate(CAMERAS):
-            stored = file[f"hybridve/cameras/{camera}/outline"]
+        for number, name in enumerate(CAMERAS):
+            stored = file[f"hybridve/cameras/{name}/outline"]
             ends = np.cumsum(
                 [len(one.outlines[number].marks) if one.outlines else 0 for one in found]
             )

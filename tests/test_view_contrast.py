@@ -1,5 +1,7 @@
 """A camera against the others as a picture: what is filled, what is dark, and what stands below."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -24,7 +26,7 @@ IN_VIEW = area(slice(0, 300), slice(0, 350))
 def drawn(**changes: object) -> NDArray[np.uint8]:
     image = np.full((*SIZE, 3), GREY, np.uint8)
     alone = (MASK & ~OTHERS, OTHERS & ~MASK)
-    known = {"name": "cam7", **changes}
+    known: dict[str, Any] = {"name": "cam7", **changes}
     return draw_contrast(image, MASK, OTHERS, alone, IN_VIEW, **known)
 
 
