@@ -7,6 +7,7 @@ not confirmed by the silhouettes either.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,7 +27,14 @@ _SIDE_PX, _FRAMES, _ERROR_PX, _SQUARE_PX = 400, 8, 1, 4
 _CELLS = 500
 
 
-def unconfirmed_share(trial: Trial) -> float:
+class Unconfirmed(NamedTuple):
+    """The share of squares of outlines that no point confirms: of all, and of each of C cameras."""
+
+    all_: float
+    by_camera: NDArray[np.float64]
+
+
+def unconfirmed_shares(trial: Trial) -> Unconfirmed:
     """Return the share of squares of outlines that no point confirms; 0 of less than three cameras.
 
     A point must be seen by all cameras but one at least, and denied by none.
@@ -34,7 +42,7 @@ def unconfirmed_share(trial: Trial) -> float:
     views, table = trial.views, trial.table
     count = len(views)
     if count < 3:
-        return 0.0
+        return Unconfirmed(0.0, np.zeros(count))
     scale = _SIDE_PX / float(views.sizes_px.max())
     sizes_px = np.maximum((views.sizes_px * scale).astype(np.int64), 1)
     matrices = views.img_from_local.copy()
@@ -44,9 +52,9 @@ def unconfirmed_share(trial: Trial) -> float:
     )
     pencils = make_pencils(small)
     told = np.flatnonzero(_is_whole(table))
+    n_squares, n_unconfirmed = np.zeros(count), np.zeros(count)
     if len(told) == 0:
-        return 0.0
-    n_squares, n_unconfirmed = 0, 0
+        return Unconfirmed(0.0, n_squares)
     for frame in told[np.unique(np.linspace(0, len(told) - 1, _FRAMES).astype(int))]:
         masks = [
             _drawn(
@@ -68,9 +76,12 @@ def unconfirmed_share(trial: Trial) -> float:
             np.full(count, _SQUARE_PX),
             _CELLS,
         )
-        n_squares += int(blocks.n_blocks.sum())
-        n_unconfirmed += len(blocks.unconfirmed)
-    return n_unconfirmed / n_squares if n_squares else 0.0
+        n_squares += blocks.n_blocks
+        n_unconfirmed += np.bincount(blocks.unconfirmed[:, 0], minlength=count)
+    return Unconfirmed(
+        float(n_unconfirmed.sum() / max(n_squares.sum(), 1.0)),
+        n_unconfirmed / np.maximum(n_squares, 1.0),
+    )
 
 
 def _is_whole(table: OutlineTable) -> NDArray[np.bool_]:

@@ -27,7 +27,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.agreement.carving import unconfirmed_share
+from hybridve.hull.agreement.carving import Unconfirmed, unconfirmed_shares
 from hybridve.hull.agreement.offsets import (
     LEAST_COUNT,
     Offset,
@@ -64,6 +64,9 @@ _PICTURES: dict[Kind, tuple[float, float]] = {
 #: A gross cause must make outlines fit by so many pixels better, and leave so much at most.
 _GROSS_GAIN_PX, _GROSS_SHARE = 2.0, 0.67
 
+#: Sizes of pictures whose logarithms differ by less come of undistorting like pictures.
+_OTHER_SIZE = 0.2
+
 #: Pictures are changed in so many frames at most, evenly chosen, to find which change is best.
 _FRAMES_TRIED = 200
 
@@ -76,6 +79,9 @@ _SUSPECT_PX, _UNCONFIRMED, _CONFIRMED_GAIN, _CONFIRMED_SHARE = 3.0, 0.08, 0.06, 
 _LEAST_BUMP_PX, _LEAST_LATE = 1.5, 0.15
 
 _SIGNIFICANT = 2.0
+
+#: A delay of so many standard errors is named even where most ends stand still.
+_PLAIN = 8.0
 
 #: From so many pixels, or frames, on a session is not to be trusted until it is mended.
 GROSS_BUMP_PX, GROSS_LATE = 4.5, 1.5
@@ -279,8 +285,8 @@ def _gross(trial: Trial, *, with_clock: bool) -> tuple[Cause | None, Trial]:
     few = trial.some(_FRAMES_TRIED)
     every = range(len(trial.views))
     suspects = [camera for camera in every if few.misfit([camera]).px >= _SUSPECT_PX]
-    share = unconfirmed_share(few)
-    if share >= _UNCONFIRMED:
+    shares = unconfirmed_shares(few)
+    if shares.all_ >= _UNCONFIRMED:
         suspects = list(every)
     least_px, best = np.inf, None
     changes = list(_changes(trial.views, suspects))
@@ -295,17 +301,14 @@ def _gross(trial: Trial, *, with_clock: bool) -> tuple[Cause | None, Trial]:
         is_gain = before.px - after.px >= _GROSS_GAIN_PX and after.px <= _GROSS_SHARE * before.px
         if is_gain and undone.misfit().px < least_px:
             least_px, best = undone.misfit().px, change
-    # A delay that explains as much is told as such, with its size.
-    for camera in suspects if with_clock else []:
-        offset = offset_of(trial, camera)
-        if offset.has_clock and abs(offset.late) > 1.0:
-            later = trial.change(camera, -offset.moved_px, offset.late).adopted()
-            if later.misfit().px < least_px:
-                return None, trial
-    if best is None and share >= _UNCONFIRMED and fair:
-        shares = [unconfirmed_share(change.make(few)) for change in fair]
-        if share - min(shares) >= max(_CONFIRMED_GAIN, _CONFIRMED_SHARE * share):
-            best = fair[int(np.argmin(shares))]
+    # A delay or a bump that explains as much is told as such, with its size.
+    for camera in suspects if best is not None else []:
+        offset = offset_of(trial, camera, far=with_clock)
+        late = offset.late if with_clock and offset.has_clock else 0.0
+        if trial.change(camera, -offset.moved_px, late).adopted().misfit().px < least_px:
+            return None, trial
+    if best is None and shares.all_ >= _UNCONFIRMED:
+        best = _confirmed_best(few, shares, fair)
     if best is None:
         return None, trial
     undone = best.make(trial)
@@ -317,6 +320,25 @@ def _gross(trial: Trial, *, with_clock: bool) -> tuple[Cause | None, Trial]:
         before_px=trial.misfit(best.cameras).px,
         after_px=undone.misfit(best.cameras).px,
     ), undone
+
+
+def _confirmed_best(
+    few: Trial, shares: Unconfirmed, changes: Sequence["_Pictures"]
+) -> "_Pictures | None":
+    """Return the change after which most of the silhouettes is confirmed, if that is enough.
+
+    What the others do not confirm must be that camera's: a chair that one camera sees may come to
+    be confirmed by chance as another's picture is turned.
+    """
+    least, best = shares.all_ - max(_CONFIRMED_GAIN, _CONFIRMED_SHARE * shares.all_), None
+    for change in changes:
+        if min(shares.by_camera[change.cameras]) < _UNCONFIRMED:
+            continue
+        undone = unconfirmed_shares(change.make(few))
+        is_own = undone.by_camera[change.cameras] <= 0.5 * shares.by_camera[change.cameras]
+        if undone.all_ <= least and is_own.all():
+            least, best = undone.all_, change
+    return best
 
 
 class _Pictures(NamedTuple):
@@ -340,7 +362,7 @@ def _changes(views: Views, suspects: Sequence[int]) -> Iterator[_Pictures]:
             yield mapped(kind, camera, np.array(turned))
         # Where the rig tells no size, nobody else notices that pictures were made smaller.
         for size in np.unique(sizes, axis=0):
-            if (size != sizes[camera]).any():
+            if np.abs(np.log(size / sizes[camera])).max() > _OTHER_SIZE:
                 yield mapped("scaled", camera, size / sizes[camera])
     for first, second in combinations(suspects, 2):
         yield _exchange(first, second)
@@ -394,14 +416,15 @@ def _tries(trial: Trial, camera: int, offset: Offset, *, with_clock: bool) -> li
     if is_late or is_bumped:
         shift = -offset.moved_px if is_bumped else None
         change = trial.change(camera, shift, offset.late if is_late else 0.0)
-        if _is_fine_gain(now, change):
+        is_plain = is_late and not is_bumped and abs(offset.late) > _PLAIN * offset.late_se
+        if is_plain or _is_fine_gain(now, change):
             before, after = now.misfit(), change.misfit()
             causes = []
             is_bumped = is_bumped and wander_of(change) <= _WANDER * offset.size_px
             if is_late:
                 causes.append(_late(trial, camera, offset, before, after))
             if is_bumped:
-                step = Step(0, offset.moved_px, error_px, 0.0)
+                step = Step(0, offset.moved_px, error_px, error_px, 0.0)
                 causes.append(_bumped(trial, camera, step, before, after))
             gain_px = (before.px - after.px) * after.count
             if causes:
@@ -454,7 +477,7 @@ def _late(trial: Trial, camera: int, offset: Offset, before: Misfit, after: Misf
 
 
 def _bumped(trial: Trial, camera: int, step: Step, before: Misfit, after: Misfit) -> Cause:
-    size, reach = float(np.linalg.norm(step.moved_px)), 1.96 * step.se_px
+    size, reach = float(np.linalg.norm(step.moved_px)), 1.96 * step.size_se_px
     return Cause(
         "bumped",
         (trial.views.names[camera],),
@@ -529,7 +552,7 @@ def _frames(trial: Trial, denies: NDArray[np.bool_] | None, causes: Sequence[Cau
         stops = np.flatnonzero(is_wrong & ~np.append(is_wrong[1:], False))
         for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
             run = excess[start : stop + 1]
-            size = float(np.nanmax(run)) if np.isfinite(run).any() else np.nan
+            size = float(np.nanmax(run)) if (run > 0.0).any() else np.nan
             found.append(Cause("frames", (name,), start, stop, size))
     return found
 

@@ -9,7 +9,8 @@ and McClure, 1985), so that what is segmented in one camera alone does not count
 Limits do not err independently: who holds still shows the same outline again and again, and a
 shadow errs at one end of it all the time. So errors are taken to be common to blocks of frames,
 and common to all that one end of one pencil ever shows (the sandwich of Liang and Zeger, 1986, for
-both groupings, added up): then they say how far the estimate would be off in another recording.
+both groupings, added up, with Student's quantiles for their numbers): then they say how far the
+estimate would be off in another recording.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from hybridve.hull.agreement.trials import MOST_PX, Change, Trial
 
@@ -74,8 +76,9 @@ class Offset:
 
     @property
     def has_clock(self) -> bool:
-        """Whether there was enough motion to tell the delay."""
-        return self.late_se <= _NO_CLOCK and self.speed_px >= _LEAST_SPEED_PX
+        """Whether there was enough motion to tell the delay, and it is not where they end."""
+        is_moving = self.speed_px >= _LEAST_SPEED_PX
+        return self.late_se <= _NO_CLOCK and is_moving and abs(self.late) < LATEST - 0.5
 
 
 def offset_of(trial: Trial, camera: int, *, far: bool = True) -> Offset:
@@ -91,8 +94,22 @@ def offset_of(trial: Trial, camera: int, *, far: bool = True) -> Offset:
         Whether delays of up to `LATEST` frames are tried; else the pictures are taken to be nearly
         in time.
     """
+    near = _offset_from(trial, camera, 0.0)
+    start = _likeliest_delay(trial, camera) if far else 0.0
+    if start == 0.0:
+        return near
+    # A picture that has moved far fits no better at its own time than at others, as it is.
+    found = _offset_from(trial, camera, start)
+    fits = [
+        trial.change(camera, -one.moved_px, one.late).misfit().px if one.count else np.inf
+        for one in (near, found)
+    ]
+    return found if fits[1] < fits[0] else near
+
+
+def _offset_from(trial: Trial, camera: int, late: float) -> Offset:
+    """Return the offset that is found from a delay on."""
     untold = Offset(np.zeros(2), 0.0, np.full(2, np.inf), np.inf)
-    late = _likeliest_delay(trial, camera) if far else 0.0
     shift, errors, speed_px, count = np.zeros(2), np.full(3, np.inf), 0.0, 0
     for number in range(_ROUNDS):
         now = trial.change(camera, shift, late)
@@ -152,16 +169,25 @@ def _errors(
     n_blocks = _add_scores(meat, scores, (frames - frames.min()) // length)
     if n_blocks <= n_unknown:
         return np.full(n_unknown, np.inf)
-    covariance = inverse @ meat @ inverse * (n_blocks / (n_blocks - float(n_unknown)))
+    covariance = inverse @ meat @ inverse * _few(n_blocks, n_unknown)
     if ends is not None:
         common = np.zeros_like(meat)
         n_ends = _add_scores(common, scores, np.unique(ends, return_inverse=True)[1])
         if n_ends > n_unknown:
-            share = n_ends / (n_ends - float(n_unknown))
-            covariance += inverse @ common @ inverse * share
+            covariance += inverse @ common @ inverse * _few(n_ends, n_unknown)
         else:  # so few ends fit whatever errs at them: reckon with as much again, and more
             covariance *= _FEW_ENDS
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def _few(n_groups: int, n_unknown: int) -> float:
+    """Return what a variance found from few groups is to be multiplied by.
+
+    They have lost the unknowns' degrees of freedom; and so few as are left make Student's
+    distribution of what would be normal, of which the 95 % are taken.
+    """
+    left = n_groups - n_unknown
+    return n_groups / left * (float(student.ppf(0.975, left)) / 1.96) ** 2
 
 
 def _add_scores(
@@ -198,7 +224,10 @@ class Step:
     moved_px : (2,) float64
         How far, along x and y.
     se_px : float
-        Standard error of either.
+        Standard error of either, if what errs at one end of a pencil all the time does so before
+        and after: whether it has moved.
+    size_se_px : float
+        Standard error of either, however it errs: how far.
     wander_px : float
         By how much two halves of the time that it holds, or held before, differ.
     """
@@ -206,6 +235,7 @@ class Step:
     first: int
     moved_px: NDArray[np.float64]
     se_px: float
+    size_se_px: float
     wander_px: float
 
 
@@ -243,9 +273,12 @@ def step_of(trial: Trial, camera: int, least_side: int) -> Step | None:
         return None
     was, became = before.shift(), after.shift()
     # What errs at one end all the time, errs before and after.
-    variance = before.error(was, by_end=False) ** 2 + after.error(became, by_end=False) ** 2
+    sure, whole = (
+        np.hypot(before.error(was, by_end=by_end), after.error(became, by_end=by_end)).max()
+        for by_end in (False, True)
+    )
     wander = max(before.wander(), after.wander())
-    return Step(place, was - became, float(np.sqrt(variance.max())), wander)
+    return Step(place, was - became, float(sure), float(whole), wander)
 
 
 def wander_of(change: Change) -> float:
