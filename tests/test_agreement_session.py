@@ -11,9 +11,10 @@ from helpers.hulls import look_at, projection
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from hybridve.hull.agreement.causes import FrameVerdicts, diagnose
-from hybridve.hull.agreement.offsets import offset_of, step_of
+from hybridve.hull.agreement.offsets import offset_of, step_of, student_95
 from hybridve.hull.agreement.outlines import (
     CUT,
     FIRST,
@@ -271,6 +272,11 @@ def test_a_change_that_is_adopted_says_the_same() -> None:
     np.testing.assert_allclose(adopted.misfit([2]).px, change.misfit().px, rtol=1e-12)
     back = adopted.change(2, np.array([-5.0, 2.0]), -1.5)
     assert back.misfit().px < trial.misfit([2]).px + 0.2
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 7, 12, 13, 20, 50, 1000])
+def test_students_quantiles_are_students(freedom: int) -> None:
+    assert student_95(freedom) == pytest.approx(student.ppf(0.975, freedom), rel=5e-3)
 
 
 def test_steps_and_offsets_need_frames() -> None:
