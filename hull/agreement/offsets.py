@@ -36,6 +36,10 @@ _FEW_ENDS = 4.0
 #: Student's quantiles, two-sided 95 %, from one degree of freedom on.
 _STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179)
 
+#: Between two frames outlines are taken to go straight: what turns within some frames, as hands do,
+#: is then late by so many frames more or less, one standard error.
+_BETWEEN_FRAMES = 0.02
+
 #: So many limits must tell.
 LEAST_COUNT = 12
 
@@ -143,7 +147,8 @@ def _offset_from(trial: Trial, camera: int, late: float) -> Offset:
         )
         if number >= 4 and np.abs(step[:2]).max() < 1e-2 and abs(step[2]) < 1e-3:
             break
-    return Offset(-shift, late, errors[:2], float(errors[2]), speed_px, count)
+    late_se = float(np.hypot(errors[2], _BETWEEN_FRAMES))
+    return Offset(-shift, late, errors[:2], late_se, speed_px, count)
 
 
 def _errors(
