@@ -179,6 +179,8 @@ class Diagnosis:
         The likeliest first.
     offsets : tuple of C Offset
         Of each camera, as it is: with what was named of it.
+    is_plain : (C,) bool
+        Whether outlines fit better without a camera's offset, as they should.
     misfit_px : (C,) float64
         How badly each camera's outlines fit the others as they are.
     is_told : bool
@@ -187,6 +189,7 @@ class Diagnosis:
 
     causes: tuple[Cause, ...]
     offsets: tuple[Offset, ...]
+    is_plain: NDArray[np.bool_]
     misfit_px: NDArray[np.float64]
     is_told: bool
 
@@ -255,13 +258,28 @@ def diagnose(
     causes += _contradictory(trial, said, causes)
     causes += _left_behind(trial, said, causes)
     causes += _frames(trial, None if said is None else said.denies, causes)
+    is_plain = np.array(
+        [
+            undone[name].any() or _is_plain(trial, camera, offsets[camera], with_clock=with_clock)
+            for camera, name in enumerate(names)
+        ]
+    )
     offsets = [
         replace(
             offset, moved_px=offset.moved_px + undone[name][:2], late=offset.late + undone[name][2]
         )
         for name, offset in zip(names, offsets, strict=True)
     ]
-    return Diagnosis(tuple(causes), tuple(offsets), misfits, is_told)
+    return Diagnosis(tuple(causes), tuple(offsets), is_plain, misfits, is_told)
+
+
+def _is_plain(trial: Trial, camera: int, offset: Offset, *, with_clock: bool) -> bool:
+    """Tell whether a camera's outlines fit as much better as they should, were its offset undone.
+
+    Where little tells an offset, as sideways of cameras of one height, anything may come out.
+    """
+    late = offset.late if with_clock and offset.has_clock else 0.0
+    return _is_fine_gain(trial.change(camera), trial.change(camera, -offset.moved_px, late))
 
 
 def _inverted(trial: Trial) -> tuple[list[Cause], Trial]:

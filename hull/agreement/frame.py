@@ -84,6 +84,9 @@ _AS_GOOD = 0.1
 #: How far these rays are followed, in depths of the local origin.
 _REACH = 4.0
 
+#: A picture of which more than this share is object has no squares.
+_MOST_OBJECT = 0.5
+
 #: A silhouette of less area than so many squares is cut into smaller ones.
 _FEW_SQUARES = 32
 
@@ -526,8 +529,10 @@ def coherence(
 def _sides_px(hull: Hull, errors: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the sides (C,) of the squares that silhouettes are cut into."""
     sides = np.maximum(4 * errors + 4, 8)
-    areas = hull.object_shares() * hull.views.sizes_px.prod(axis=1)
-    return np.where(areas < _FEW_SQUARES * sides**2, sides // 2, sides)
+    shares, sizes_px = hull.object_shares(), hull.views.sizes_px
+    sides = np.where(shares * sizes_px.prod(axis=1) < _FEW_SQUARES * sides**2, sides // 2, sides)
+    # What is mostly object is no silhouette; thousands of squares would be looked for in vain.
+    return np.where(shares > _MOST_OBJECT, sizes_px.max(axis=1) + 1, sides)
 
 
 def disputes(

@@ -320,6 +320,9 @@ def _seen(change: Change) -> "_Seen":
     )
 
 
+#: No end gains or loses more than it was expected to and so many pixels.
+_FLIPPED_PX = 2.0
+
 #: Places in a session at which a step is looked for, before it is made exact.
 _PLACES = 12
 
@@ -395,4 +398,6 @@ def ends_gain(now: Change, then: Change, since: int = 0) -> tuple[NDArray[np.flo
     ]
     is_told = np.isfinite(values[0]).sum(axis=1) >= LEAST_BLOCK
     was, became, moves = (np.nanmedian(one[is_told], axis=1) for one in values)
-    return was - became, np.hypot(became, moves) - became
+    expected = np.hypot(became, moves) - became
+    # An end that takes another partner says little, however far that is.
+    return np.clip(was - became, -expected - _FLIPPED_PX, expected + _FLIPPED_PX), expected

@@ -73,7 +73,7 @@ def judge_session(
                 key=lambda cause: not cause.is_gross,
             )
         ),
-        {name: _camera(found, camera, step, len(views)) for camera, name in enumerate(views.names)},
+        {name: _camera(found, camera, step) for camera, name in enumerate(views.names)},
     )
 
 
@@ -109,17 +109,17 @@ def _named(
     )
 
 
-def _camera(found: Diagnosis, camera: int, step: int, n_cameras: int) -> CameraAgreement:
+def _camera(found: Diagnosis, camera: int, step: int) -> CameraAgreement:
     offset: Offset = found.offsets[camera]
     error = offset.moved_se_px
     is_placed = bool(np.isfinite(error).all())
     late = offset.late * step if offset.has_clock else None
     excess = 0.0
-    # Of two cameras nobody knows which of them was bumped: both may have been.
-    if is_placed and offset.size_px > 2.0 * float(error.max()) and n_cameras > 1:
+    is_plain = bool(found.is_plain[camera])
+    if is_plain and is_placed and offset.size_px > 2.0 * float(error.max()):
         reach_px = offset.size_px + _ONE_SIDED_95 * float(error.max())
         excess = max(0.0, reach_px - STATED_PX)
-    if late is not None and abs(offset.late) > 2.0 * offset.late_se:
+    if is_plain and late is not None and abs(offset.late) > 2.0 * offset.late_se:
         excess += abs(offset.late) * _FAST * offset.speed_px
     return CameraAgreement(
         _told(float(found.misfit_px[camera])),
