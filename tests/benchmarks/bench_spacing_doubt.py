@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from helpers.erring_task import erring_task
+from helpers.seen import FINER, finer, inside_px
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.lens_bound import lens_shift_px
@@ -63,9 +64,6 @@ _NEAR_M = 0.012
 
 #: The error of an outline is alike over so many pixels.
 _SMOOTH_PX = 40
-
-#: The true outlines are found on a grid so many times finer.
-_FINER = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,11 +134,11 @@ class Payload:
         self._layout = Layout.of(load_scene(folder / "scene.toml"), ["payload_a"], move)
         needed_m = self.truth.needed_hull_by_frame_m
         self.frames = np.flatnonzero(needed_m > needed_m.max() - _NEAR_M).tolist()
-        views = [make_view(_finer(camera)) for camera in self._true]
+        views = [make_view(finer(camera)) for camera in self._true]
         shapes = list(truth.shapes.values())
         self._inside_px = [
             [
-                _inside_px(
+                inside_px(
                     true_silhouette(
                         view, shapes, [truth.world_from_shape[name][frame] for name in truth.shapes]
                     )
@@ -164,10 +162,10 @@ class Payload:
             outline_errors(views.names, rig, shift_px, self._settings), self._settings
         )
         blocked, unsure, std_m = [], [], []
-        for inside_px in self._inside_px:
+        for of_frame in self._inside_px:
             masks = [
                 undistort_mask(self._mask(*seen), lens)
-                for *seen, lens in zip(inside_px, true, beside_px, lenses, strict=True)
+                for *seen, lens in zip(of_frame, true, beside_px, lenses, strict=True)
             ]
             hull = make_hull(views, masks)
             mine = blocked_shifts(hull, self._layout.moved, move)
@@ -204,10 +202,10 @@ class Payload:
         """Return a silhouette whose outline errs, smoothly along it."""
         width, height = camera.width_px, camera.height_px
         # The centre of pixel x, less what the image is beside, on the finer grid.
-        column, row = _FINER * (0.5 - beside_px) - 0.5
+        column, row = FINER * (0.5 - beside_px) - 0.5
         at_centres = cv2.warpAffine(
             inside_px,
-            np.array([[_FINER, 0.0, column], [0.0, _FINER, row]]),
+            np.array([[FINER, 0.0, column], [0.0, FINER, row]]),
             (width, height),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
@@ -217,25 +215,6 @@ class Payload:
         # Between its nodes an interpolated field varies less than at them.
         error *= self._settings.segmentation_px / np.sqrt(np.mean(error**2))
         return np.asarray(at_centres > error, np.uint8)
-
-
-def _finer(camera: Camera) -> Camera:
-    """Return a camera with so many times as many pixels each way."""
-    scale = np.array([_FINER] * 4 + [1.0] * (len(camera.params) - 4))
-    return replace(
-        camera,
-        width_px=_FINER * camera.width_px,
-        height_px=_FINER * camera.height_px,
-        params=camera.params * scale,
-    )
-
-
-def _inside_px(fine: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return how deep each place of a fine grid lies in a silhouette, pixels, negative outside."""
-    inside = (fine > 0).astype(np.uint8)
-    depth = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    away = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(np.where(fine > 0, depth - 0.5, 0.5 - away) / _FINER, np.float32)
 
 
 def payload(
