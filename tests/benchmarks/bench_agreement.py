@@ -422,8 +422,8 @@ def draws(asked: argparse.Namespace) -> dict[str, float]:
             if said.outcome != "rightly":
                 n_alarms += 1
                 _tell(f"{name}, clean", seed, said)
-            for camera in names:
-                _own(clean, found, camera, 0.0, np.zeros(2))
+            for of_camera in names:
+                _own(clean, found, of_camera, 0.0, np.zeros(2))
             camera = int(rng.integers(2))
             size = float(rng.choice([-1.0, 1.0]) * rng.choice([0.3, 1.0, 2.5, 6.0]))
             spoil = Spoil("late", "late", (camera,), late=size)
@@ -514,7 +514,10 @@ def cost(asked: argparse.Namespace) -> dict[str, float]:
 
 
 def _cost_of(what: str, views: Views, masks: list[list[NDArray[np.uint8]]]) -> dict[str, float]:
-    lenses = [Undistortion(*size.tolist(), np.eye(3), None, None) for size in views.sizes_px]
+    lenses = [
+        Undistortion(width, height, np.eye(3), None, None)
+        for width, height in views.sizes_px.tolist()
+    ]
     witness = Witness.of(views, lenses, is_still=True)
     hulls = [make_hull(views, frame) for frame in masks]
     witness.look(0, hulls[0])  # compiled
@@ -587,7 +590,7 @@ def _cost_in_detect() -> dict[str, float]:
         return call
 
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
-        stack.enter_context(patch.object(trust, "outline_of", timed(trust.outline_of)))
+        stack.enter_context(patch("hybridve.hull.trust.outline_of", timed(outline_of)))
         stack.enter_context(patch("hybridve.hull.batch.judge_cameras", timed(trust.judge_cameras)))
         started = time.perf_counter()
         write_report(chain, Path(place) / "r.h5", DetectSettings(settings), Terminal(enabled=False))
