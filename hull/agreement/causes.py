@@ -78,10 +78,14 @@ _SUSPECT_PX, _UNCONFIRMED, _CONFIRMED_GAIN, _CONFIRMED_SHARE = 3.0, 0.08, 0.06, 
 #: What is tolerated: outlines and rigs are off by a pixel or two, clocks of cameras by a tenth.
 _LEAST_BUMP_PX, _LEAST_LATE = 1.5, 0.15
 
+#: A picture that is off by more than this, in pixels, was not bumped: outlines meet by chance.
+_FARTHEST_BUMP_PX = 60.0
+
 _SIGNIFICANT = 2.0
 
-#: A delay of so many standard errors is named even where most ends stand still.
-_PLAIN = 8.0
+#: A delay of so many standard errors is named even where most ends stand still, if others move by
+#: so many pixels a frame.
+_PLAIN, _PLAIN_SPEED_PX = 8.0, 1.0
 
 #: From so many pixels, or frames, on a session is not to be trusted until it is mended.
 GROSS_BUMP_PX, GROSS_LATE = 4.5, 1.5
@@ -322,6 +326,8 @@ def _gross(trial: Trial, *, with_clock: bool) -> tuple[Cause | None, Trial]:
     # A delay or a bump that explains as much is told as such, with its size.
     for camera in suspects if best is not None else []:
         offset = offset_of(trial, camera, far=with_clock)
+        if offset.size_px > _FARTHEST_BUMP_PX:
+            continue
         late = offset.late if with_clock and offset.has_clock else 0.0
         if trial.change(camera, -offset.moved_px, late).adopted().misfit().px < least_px:
             return None, trial
@@ -434,7 +440,12 @@ def _tries(trial: Trial, camera: int, offset: Offset, *, with_clock: bool) -> li
     if is_late or is_bumped:
         shift = -offset.moved_px if is_bumped else None
         change = trial.change(camera, shift, offset.late if is_late else 0.0)
-        is_plain = is_late and not is_bumped and abs(offset.late) > _PLAIN * offset.late_se
+        is_plain = (
+            is_late
+            and not is_bumped
+            and abs(offset.late) > _PLAIN * offset.late_se
+            and offset.speed_px >= _PLAIN_SPEED_PX
+        )
         if is_plain or _is_fine_gain(now, change):
             before, after = now.misfit(), change.misfit()
             causes = []
@@ -452,6 +463,7 @@ def _tries(trial: Trial, camera: int, offset: Offset, *, with_clock: bool) -> li
     if (
         step_ is not None
         and _is_beyond(step_.moved_px, step_.se_px)
+        and step_.size_se_px < float(np.linalg.norm(step_.moved_px))
         and step_.wander_px <= _WANDER * float(np.linalg.norm(step_.moved_px))
     ):
         rows = np.arange(trial.table.n_frames)[:, None]
@@ -465,7 +477,8 @@ def _tries(trial: Trial, camera: int, offset: Offset, *, with_clock: bool) -> li
 
 
 def _is_beyond(moved_px: NDArray[np.float64], error_px: float) -> bool:
-    return float(np.linalg.norm(moved_px)) - _SIGNIFICANT * error_px > _LEAST_BUMP_PX
+    size_px = float(np.linalg.norm(moved_px))
+    return size_px - _SIGNIFICANT * error_px > _LEAST_BUMP_PX and size_px <= _FARTHEST_BUMP_PX
 
 
 def _is_fine_gain(now: Change, change: Change, since: int = 0) -> bool:
@@ -513,7 +526,12 @@ def _bumped(trial: Trial, camera: int, step: Step, before: Misfit, after: Misfit
 def _contradictory(
     trial: Trial, said: FrameVerdicts | None, causes: Sequence[Cause]
 ) -> list[Cause]:
-    """Return the cameras that contradict the others most of the time, whatever was tried."""
+    """Return the cameras that contradict the others most of the time, whatever was tried.
+
+    With a gross cause, what single frames say of the others tells nothing.
+    """
+    if any(cause.is_gross for cause in causes):
+        return []
     named = {name for cause in causes for name in cause.cameras}
     last = trial.table.n_frames - 1
     found = []
@@ -529,8 +547,7 @@ def _contradictory(
             is_off = is_off or said.denies[:, camera].mean() > _MOST_FRAMES
         if is_off:
             found.append(Cause("contradictory", (name,), 0, last, before_px=fit.px))
-    is_gross = any(cause.is_gross for cause in [*causes, *found])
-    if said is not None and not is_gross and said.is_contradictory.mean() > _MOST_FRAMES:
+    if said is not None and not found and said.is_contradictory.mean() > _MOST_FRAMES:
         found.append(Cause("contradictory", (), 0, last))
     return found
 
