@@ -390,6 +390,17 @@ def test_what_one_camera_sees_all_the_time_was_left_behind(
     assert told == expected
 
 
+def test_cameras_at_one_place_tell_nothing_of_each_other() -> None:
+    views = ring_views(2)
+    matrices = views.img_from_local[[0, 0]]
+    twins = replace(views, img_from_local=matrices)
+    frames = [[masks[0], masks[0]] for masks in session_of(2)]
+    found = diagnose(trial_of(twins, frames))
+
+    assert found.causes == ()
+    assert not found.is_told
+
+
 def test_frames_that_lie_apart_tell_no_clock() -> None:
     agreement = judged(session_of(4, (0.0, 5.0)), step=10)
 

@@ -84,8 +84,8 @@ _AS_GOOD = 0.1
 #: How far these rays are followed, in depths of the local origin.
 _REACH = 4.0
 
-#: A picture of which more than this share is object has no squares.
-_MOST_OBJECT = 0.5
+#: A picture of which more than this share is object is cut into so many squares at most.
+_MOST_OBJECT, _MOST_SQUARES = 0.5, 400
 
 #: A silhouette of less area than so many squares is cut into smaller ones.
 _FEW_SQUARES = 32
@@ -531,8 +531,9 @@ def _sides_px(hull: Hull, errors: NDArray[np.int64]) -> NDArray[np.int64]:
     sides = np.maximum(4 * errors + 4, 8)
     shares, sizes_px = hull.object_shares(), hull.views.sizes_px
     sides = np.where(shares * sizes_px.prod(axis=1) < _FEW_SQUARES * sides**2, sides // 2, sides)
-    # What is mostly object is no silhouette; thousands of squares would be looked for in vain.
-    return np.where(shares > _MOST_OBJECT, sizes_px.max(axis=1) + 1, sides)
+    # What is mostly object is no silhouette: of thousands of squares each would be looked for.
+    large = np.sqrt(sizes_px.prod(axis=1) / _MOST_SQUARES).astype(np.int64)
+    return np.where(shares > _MOST_OBJECT, np.maximum(large, sides), sides)
 
 
 def disputes(

@@ -386,6 +386,8 @@ def ends_gain(now: Change, then: Change, since: int = 0) -> tuple[NDArray[np.flo
         squares.
     """
     before, after = (one.misses().miss_px[:, since:] for one in (now, then))
+    if before.size == 0:  # a camera at the place of all others has no pencils
+        return np.zeros(0), np.zeros(0)
     is_both = np.isfinite(before) & np.isfinite(after)
     before, after = (np.where(is_both, one, np.nan) for one in (before, after))
     values = [
