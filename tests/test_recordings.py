@@ -1,6 +1,7 @@
 """The whole chain on real recordings, against what others found there."""
 
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -252,6 +253,22 @@ def test_horseman_engines_find_the_same(run: Run, horseman: Path, tmp_path: Path
 
 
 @pytest.mark.slow
+def test_the_board_that_leans_on_a_chair_is_told_and_nothing_else(
+    run: Run, horseman: Path, tmp_path: Path
+) -> None:
+    """It is not in the empty scene, and only cam3 sees it: so the recording's own page says."""
+    folder, path = tmp_path / "horseman", tmp_path / "report.h5"
+    shutil.copytree(horseman, folder, ignore=shutil.ignore_patterns("silhouettes.h5"))
+    arguments = ["--scene", DATA / "horseman" / "scene.toml", "-o", path, "--frames", "0:426:20"]
+
+    assert run("detect", folder, *arguments, "--no-response", "--fail-on-doubt") == 0
+
+    agreement = read_report(path).agreement
+    told = [(cause.kind, cause.cameras, cause.is_gross) for cause in agreement.causes]
+    assert told == [("left behind", ("cam3",), False)]
+    assert all(camera.excess_px < 0.5 for camera in agreement.cameras.values())
+
+
 def test_collision_points_lie_in_the_hull(run: Run, horseman: Path, tmp_path: Path) -> None:
     path = tmp_path / "report.h5"
     scene = DATA / "horseman" / "scene.toml"

@@ -94,6 +94,9 @@ GROSS_BUMP_PX, GROSS_LATE = 4.5, 1.5
 #: better. So many ends must tell, and no more than this share of them fit worse, by so many pixels.
 _EXPECTED_SHARE, _LEAST_ENDS, _MOST_WORSE, _NO_WORSE_PX = 0.55, 4, 0.2, 1.0
 
+#: Another camera says something of a change if it is expected to gain this share of all.
+_PARTNER_SHARE = 0.1
+
 #: A picture that was moved stays there: halves of the time differ by no more than this share of it.
 _WANDER = 0.35
 
@@ -114,9 +117,9 @@ _FRAME_PX, _FRAME_SHARE, _OTHERS_PX = 4.0, 0.8, 1.5
 #: And by so many pixels worse in the middle one of them.
 _FRAME_MEDIAN_PX = 6.0
 
-#: Something was left behind that one camera sees in this share of the frames, in a place that
-#: moves by no more than so many pixels.
-_ALL_THE_TIME, _SAME_PLACE_PX = 0.9, 30.0
+#: Something was left behind that one camera sees in this share of the frames, about a place that
+#: moves by no more than so many pixels: of a large thing now this square is denied, now that.
+_ALL_THE_TIME, _SAME_PLACE_PX = 0.9, 60.0
 
 #: A camera contradicts the session whose outlines fit the others no better than this, in pixels
 #: (15 is the most), if they support no more than this share of its silhouette; or that denies what
@@ -483,10 +486,14 @@ def _is_beyond(moved_px: NDArray[np.float64], error_px: float) -> bool:
 
 def _is_fine_gain(now: Change, change: Change, since: int = 0) -> bool:
     """Tell whether a change does to the ends of a camera's pencils what it would, were it so."""
-    gains, expected = ends_gain(now, change, since)
+    gains, expected, partner = ends_gain(now, change, since)
     is_worse = gains < -_NO_WORSE_PX
+    # With one other camera alone outlines may come to fit by chance: two must say so, if there are.
+    of_partner, told = (np.bincount(partner, value, minlength=1) for value in (gains, expected))
+    agree = (told >= _PARTNER_SHARE * expected.sum()) & (of_partner >= _EXPECTED_SHARE * told)
     return bool(
         len(gains) >= _LEAST_ENDS
+        and agree.sum() >= min(2, len(now.rows))
         and gains.sum() >= _EXPECTED_SHARE * expected.sum()
         and is_worse.mean() <= _MOST_WORSE
     )
@@ -563,9 +570,12 @@ def _left_behind(trial: Trial, said: FrameVerdicts | None, causes: Sequence[Caus
         if is_told.mean() < _ALL_THE_TIME:
             continue
         box = np.median(boxes[is_told], axis=0)
-        away_px = np.abs(boxes[is_told] - box).max(axis=1)
+        middles = (boxes[is_told, :2] + boxes[is_told, 2:]) / 2.0
+        away_px = np.abs(middles - (box[:2] + box[2:]) / 2.0).max(axis=1)
         if (away_px <= _SAME_PLACE_PX).mean() >= _ALL_THE_TIME:
             last = trial.table.n_frames - 1
+            low, high = np.percentile(boxes[is_told], (5, 95), axis=0)
+            box = np.concatenate([low[:2], high[2:]])
             found.append(Cause("left behind", (name,), 0, last, box_px=box))
     return found
 

@@ -380,14 +380,14 @@ def ends_gain(now: Change, then: Change, since: int = 0) -> tuple[NDArray[np.flo
 
     Returns
     -------
-    gains, expected : (E,) float64
+    gains, expected, partner : (E,) float64, float64, int64
         By how much each end that tells misses its like less, and by how much it would, were the
         change the truth: medians over frames, in pixels. What it moves and what is left add up in
-        squares.
+        squares. And which other camera's it is, numbered from 0.
     """
     before, after = (one.misses().miss_px[:, since:] for one in (now, then))
     if before.size == 0:  # a camera at the place of all others has no pencils
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
     is_both = np.isfinite(before) & np.isfinite(after)
     before, after = (np.where(is_both, one, np.nan) for one in (before, after))
     values = [
@@ -402,4 +402,6 @@ def ends_gain(now: Change, then: Change, since: int = 0) -> tuple[NDArray[np.flo
     was, became, moves = (np.nanmedian(one[is_told], axis=1) for one in values)
     expected = np.hypot(became, moves) - became
     # An end that takes another partner says little, however far that is.
-    return np.clip(was - became, -expected - _FLIPPED_PX, expected + _FLIPPED_PX), expected
+    gains = np.clip(was - became, -expected - _FLIPPED_PX, expected + _FLIPPED_PX)
+    partner = np.repeat(np.arange(len(before)) % len(now.rows), 2)[is_told]
+    return gains, expected, partner
