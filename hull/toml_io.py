@@ -33,10 +33,15 @@ def read_toml(
         raise error_class(f"{path}: not valid TOML: {error}") from error
 
 
-def explain_validation(error: ValidationError, path: Path) -> str:
-    """Return one line for the first thing that is wrong: file, key, what was found and expected."""
+def explain_validation(
+    error: ValidationError, path: Path, within: tuple[str | int, ...] = ()
+) -> str:
+    """Return one line for the first thing that is wrong: file, key, what was found and expected.
+
+    `within` leads to the table that was checked, in a file that holds more.
+    """
     first = error.errors()[0]
-    place = [str(part + 1) if isinstance(part, int) else part for part in first["loc"]]
+    place = [str(part + 1) if isinstance(part, int) else part for part in (*within, *first["loc"])]
     key = ".".join(place)
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
