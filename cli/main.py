@@ -15,6 +15,7 @@ from hybridve.cli.detect import detect
 from hybridve.cli.doctor import doctor
 from hybridve.cli.render import render
 from hybridve.cli.segment import segment
+from hybridve.cli.simulate import simulate
 from hybridve.cli.spacing import spacing
 from hybridve.cli.summary import summary
 from hybridve.cli.sweep import sweep
@@ -58,7 +59,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 for command in (
     *(demo, synth, calibrate, convert, segment, detect),
-    *(spacing, sweep, summary, render, doctor),
+    *(spacing, sweep, simulate, summary, render, doctor),
 ):
     cli.add_command(command)
 

@@ -1,4 +1,4 @@
-"""``hybridve render``: one frame as a picture."""
+"""``hybridve render``: one frame as a picture, or a simulation as a film."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,15 +13,21 @@ if TYPE_CHECKING:
     from hybridve.hull.report.read import Report
 
 
-@click.command(short_help="Draw one frame: cameras, hull, CAD, collisions in red.")
+@click.command(short_help="Draw one frame: cameras, hull, CAD, collisions in red; or a simulation.")
 @options.session_arg
 @options.scene_option
-@options.output_option("The picture to write, a .png or .jpg.")
+@options.output_option("The picture to write, a .png or .jpg; of a simulation also a film, .mp4.")
 @click.option(
     "--report",
     type=click.Path(path_type=Path),
     help="Choose the frame in which this report has most collision points; for --view agreement "
     "the middle of the worst that it says of the cameras, if it says any.",
+)
+@click.option(
+    "--sim",
+    type=click.Path(path_type=Path),
+    help="Draw what this simulation made of the scene: the frame in which most is touched, or "
+    "--frame; all of them into an .mp4.",
 )
 @click.option("--frame", type=click.IntRange(0), help="Which frame. Default: the report's, or 0.")
 @click.option(
@@ -39,6 +45,7 @@ def render(
     scene: Path,
     output: Path,
     report: Path | None,
+    sim: Path | None,
     frame: int | None,
     view: str,
     engine: options.EngineName,
@@ -51,6 +58,7 @@ def render(
       hybridve render my_session --scene scene.toml --report report.h5 -o worst.png
       hybridve render my_session --scene scene.toml --frame 120 --view cameras -o seen.png
       hybridve render my_session --scene scene.toml --report report.h5 --view agreement -o who.png
+      hybridve render my_session --scene scene.toml --sim sim.h5 -o sim.mp4
     """
     import cv2
 
@@ -66,6 +74,11 @@ def render(
 
     cv2.setNumThreads(1)
     refuse_existing(output, overwrite=overwrite)
+    if sim is not None:
+        if report is not None or view != "scene":
+            raise click.UsageError("--sim is drawn from outside; drop --report and --view")
+        _render_simulation(session, scene, sim, output, frame)
+        return
     if output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise click.UsageError(f"{output}: pictures are .png or .jpg")
     loaded = None if report is None else read_report(report)
@@ -82,6 +95,49 @@ def render(
         picture = draw_scene(shot, (1600, 1000)) if view == "scene" else draw_cameras(shot)
     write_picture(output, picture)
     click.echo(f"{output}: frame {frame or 0}")
+
+
+#: Sizes of a picture and of a film's.
+_PICTURE_PX, _FILM_PX = (1600, 1000), (1280, 800)
+
+
+def _render_simulation(
+    session: Path, scene: Path, sim: Path, output: Path, frame: int | None
+) -> None:
+    """Draw one frame of a simulation, or all as a film."""
+    import numpy as np
+
+    from hybridve.calib.errors import ReportError
+    from hybridve.hull.cad.scene import load_scene
+    from hybridve.hull.capture.session import load_session
+    from hybridve.hull.chain import EvaluateSettings, make_chain
+    from hybridve.hull.report.simulation_file import read_simulation
+    from hybridve.hull.show_simulation import draw_film, draw_frame, refuse_other
+    from hybridve.hull.view.film import FILMS, write_film
+    from hybridve.hull.view.picture import write_picture
+
+    is_film = output.suffix.lower() in FILMS
+    if not is_film and output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise click.UsageError(f"{output}: pictures are .png or .jpg, films .mp4")
+    if is_film and frame is not None:
+        raise click.UsageError("--frame is of one picture; a film has them all")
+    simulation = read_simulation(sim)
+    frames = options.Frames().convert(simulation.settings["frames"], None, None)
+    chain = make_chain(load_session(session), load_scene(scene), EvaluateSettings(frames=frames))
+    refuse_other(chain, simulation)
+    if is_film:
+        fps = chain.session.fps / frames.step
+        count = write_film(output, draw_film(chain, simulation, _FILM_PX), fps)
+        click.echo(f"{output}: {options.counted(count, 'frame')}")
+        return
+    if frame is None:
+        met = np.sum([one.values["n_contacts"] for one in simulation.groups.values()], axis=0)
+        frame = int(simulation.index[int(np.argmax(met))])
+    rows = np.flatnonzero(simulation.index == frame)
+    if not len(rows):
+        raise ReportError(f"{sim}: has no frame {frame}")
+    write_picture(output, draw_frame(chain, simulation, int(rows[0]), _PICTURE_PX))
+    click.echo(f"{output}: frame {frame}")
 
 
 def _chosen_frame(report: "Report", causes: "Sequence[NamedCause]") -> int:

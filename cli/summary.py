@@ -34,16 +34,24 @@ _MOST_NAMES = 8
 def summary(report: Path, as_json: bool, picture: Path | None, overwrite: bool) -> None:
     r"""Tell what REPORT found: what was touched or came near, when, and how sure that is.
 
+    Of a simulation, SIM.h5, what every effect met and did.
+
     \b
     Example:
       hybridve summary report.h5 --picture curves.png
       hybridve summary report.h5 --json | jq '.objects[] | select(.frames_colliding > 0).name'
     """
     from hybridve.hull.report.read import read_report
+    from hybridve.hull.report.result_file import format_of
     from hybridve.hull.report.summarize import summarize
 
     if picture is not None:
         _refuse_picture(picture, overwrite=overwrite)
+    if format_of(report) == "simulation":
+        from hybridve.cli.simulate import tell_simulation
+
+        tell_simulation(report, picture, as_json=as_json)
+        return
     loaded = read_report(report)
     if picture is not None:
         from hybridve.hull.curves import write_curves

@@ -67,8 +67,20 @@ def detect_one(
 ) -> None:
     """Evaluate a recording against a layout into a report."""
     refuse_existing(output, overwrite=settings.overwrite)
-    chain = make_chain(load_session(session), load_scene(scene), settings.evaluation, watcher.stage)
+    loaded = load_scene(scene)
+    _say_not_simulated(loaded, watcher)
+    chain = make_chain(load_session(session), loaded, settings.evaluation, watcher.stage)
     write_report(chain, output, settings, watcher)
+
+
+def _say_not_simulated(scene: Scene, watcher: Watcher) -> None:
+    """Say that effects are left alone, where a scene names some."""
+    if scene.effects:
+        kinds = ", ".join(str(effect["kind"]) for effect in scene.effects)
+        watcher.say(
+            f"{scene.path}: names effects ({kinds}), which detect leaves alone; "
+            "`hybridve simulate` simulates them"
+        )
 
 
 def write_report(chain: Chain, output: Path, settings: DetectSettings, watcher: Watcher) -> None:
@@ -153,6 +165,9 @@ def detect_every(
             refuse_existing(path, overwrite=settings.overwrite)
     loaded = {name: _load(load_session, path, watcher) for name, path in sessions.items()}
     layouts = {name: _load(load_scene, path, watcher) for name, path in scenes.items()}
+    for scene in layouts.values():
+        if isinstance(scene, Scene):
+            _say_not_simulated(scene, watcher)
     pairs: list[Pair] = []
     for name, session in loaded.items():
         for layout, scene in layouts.items():

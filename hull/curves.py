@@ -1,4 +1,4 @@
-"""A report as curves: the clearance of each object against time."""
+"""Results as curves: clearances of a report, energy and penetration of a simulation."""
 
 from pathlib import Path
 
@@ -6,8 +6,10 @@ import numpy as np
 
 from hybridve.calib.errors import ReportError
 from hybridve.hull.report.read import ObjectColumns, Report
+from hybridve.hull.report.simulation_data import StoredSimulation
 from hybridve.hull.report.summarize import count_without_hull
 from hybridve.hull.view.chart import ClearanceCurve, write_clearances
+from hybridve.hull.view.simulation_chart import EffectCurve, write_effects
 
 #: Panels in one picture, the nearest objects; more could not be read.
 _MOST_PANELS = 12
@@ -60,3 +62,29 @@ def _curve(name: str, rows: ObjectColumns, report: Report) -> ClearanceCurve:
 
 def _nearest_mm(curve: ClearanceCurve) -> float:
     return float(np.fmin.reduce(curve.lower_mm, initial=np.inf))
+
+
+def write_simulation_curves(path: Path, simulation: StoredSimulation) -> None:
+    """Draw energy and penetration of each effect of a simulation against time.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    """
+    curves = []
+    for name, group in list(simulation.groups.items())[:_MOST_PANELS]:
+        energy_j = group.values["kinetic_j"] + group.values["potential_j"]
+        curves.append(
+            EffectCurve(
+                name=f"{name} ({group.kind})",
+                time_s=simulation.time_s,
+                energy_j=energy_j,
+                given_j=energy_j[0] + group.values["hull_work_j"],
+                penetration_mm=1e3 * group.values["penetration_m"],
+                is_met=group.values["n_contacts"] > 0,
+            )
+        )
+    left_out = len(simulation.groups) - len(curves)
+    more = f" (the first {len(curves)} of {len(simulation.groups)} effects)" if left_out else ""
+    write_effects(path, curves, title=f"{simulation.path.name}: what every effect met{more}")

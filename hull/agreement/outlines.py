@@ -7,9 +7,9 @@ would become of it if the picture were mirrored, shifted, or that of another cam
 without a look at the pixels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -132,6 +132,48 @@ class FrameOutlines:
         nothing = np.full(n_cameras, np.nan)
         nowhere = np.full((n_cameras, 4), np.nan)
         return cls(index, (), np.zeros(n_cameras, np.bool_), nothing, nowhere)
+
+
+def pack_frames(frames: Sequence[FrameOutlines]) -> dict[str, NDArray[Any]]:
+    """Return what frames give to the judgement, at least one of them, as arrays to be stored."""
+    outlines = [outline for frame in frames for outline in frame.outlines]
+    return {
+        "index": np.array([frame.index for frame in frames], np.int64),
+        "n_outlines": np.array([len(frame.outlines) for frame in frames], np.int64),
+        "n_corners": np.array([len(outline.marks) for outline in outlines], np.int64),
+        "corners_px": np.concatenate(
+            [np.zeros((0, 2), np.float32), *(outline.corners_px for outline in outlines)]
+        ),
+        "marks": np.concatenate([np.zeros(0, np.uint8), *(outline.marks for outline in outlines)]),
+        "is_inverse": np.array([outline.is_inverse for outline in outlines], np.bool_),
+        "deniers": np.array([frame.deniers for frame in frames]),
+        "supported_share": np.array([frame.supported_share for frame in frames]),
+        "alone_px": np.array([frame.alone_px for frame in frames]),
+        "is_contradictory": np.array([frame.is_contradictory for frame in frames]),
+    }
+
+
+def unpack_frames(packed: Mapping[str, NDArray[Any]]) -> list[FrameOutlines]:
+    """Return the frames that `pack_frames` was given."""
+    corner_ends = packed["n_corners"].cumsum()
+    outlines = [
+        Outline(packed["corners_px"][start:stop], packed["marks"][start:stop], bool(is_inverse))
+        for start, stop, is_inverse in zip(
+            corner_ends - packed["n_corners"], corner_ends, packed["is_inverse"], strict=True
+        )
+    ]
+    ends = packed["n_outlines"].cumsum()
+    return [
+        FrameOutlines(
+            int(packed["index"][row]),
+            tuple(outlines[stop - packed["n_outlines"][row] : stop]),
+            packed["deniers"][row],
+            packed["supported_share"][row],
+            packed["alone_px"][row],
+            is_contradictory=bool(packed["is_contradictory"][row]),
+        )
+        for row, stop in enumerate(ends.tolist())
+    ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -112,6 +112,15 @@ def writing(path: Path) -> Iterator[h5py.File]:
         raise ReportError(f"{path}: cannot be written: {error}") from error
 
 
+def format_of(path: Path) -> str:
+    """Return which result a file holds: "report", "simulation", ...; "" if it is none of ours."""
+    try:
+        with h5py.File(path, "r") as file:
+            return str(file.attrs.get("format", "")).removeprefix("hybridve-")
+    except OSError:
+        return ""
+
+
 @contextmanager
 def reading(path: Path, what: str, *versions: int) -> Iterator[h5py.File]:
     """Yield a file of the format ``hybridve-WHAT`` and one of these versions to read from.

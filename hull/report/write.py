@@ -46,7 +46,8 @@ from hybridve.hull.report.columns import (
 from hybridve.hull.report.machine import utc_now
 from hybridve.hull.report.result_file import STORED, store, store_text, write_run, writing
 from hybridve.hull.report.schema import VERSION, Column, FrameResult, ReportHeader
-from hybridve.hull.report.vtk import MOST_SHOWN, FramePoints, add_vtkhdf
+from hybridve.hull.report.vtk import MOST_SHOWN, add_vtkhdf
+from hybridve.hull.report.vtk_blocks import FramePoints
 from hybridve.hull.report.withdraw import doubted, withdrawn
 
 #: A part is finished after this many frames or runs of collision points, whichever comes first.

@@ -1,6 +1,6 @@
-"""What is drawn beside the hull: CAD objects and what of them collides."""
+"""What is drawn beside the hull: CAD objects and what of them collides, points and paths."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,26 @@ class DrawnObject:
     def corners_world(self) -> NDArray[np.float64]:
         """The vertices of each triangle, (T, 3, 3) metres."""
         return self.vertices_world[self.faces]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marks:
+    """What is drawn over a picture.
+
+    Attributes
+    ----------
+    points_world : (N, 3) float64
+        Dots.
+    paths_world : tuple of (P, 3) float64
+        Ways that something went, each with an arrow's head at its end and at every `head_every`-th
+        of its places, as in figure 5 of the paper.
+    head_every : int
+        Places from one head to the next.
+    """
+
+    points_world: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    paths_world: tuple[NDArray[np.float64], ...] = ()
+    head_every: int = 5
 
 
 def thinned(points: NDArray[np.float64], spacing: float) -> NDArray[np.int64]:

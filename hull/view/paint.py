@@ -4,7 +4,7 @@ Drawn in layers at twice the picture's size in each direction, put together by
 ``shaders/compose.frag.glsl``, and averaged down.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import moderngl
@@ -17,7 +17,7 @@ from hybridve.hull.query.device import make_current, open_device
 from hybridve.hull.query.engine import Closing
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import Cells
-from hybridve.hull.view.drawn import DrawnObject, thinned
+from hybridve.hull.view.drawn import DrawnObject, Marks, thinned
 from hybridve.hull.view.novel import (
     NEVER_M,
     HullOnDevice,
@@ -45,12 +45,18 @@ COLLIDING_RGB: Rgb = (0.93, 0.79, 0.76)
 TOUCHED_RGB: Rgb = (0.93, 0.53, 0.47)
 INSIDE_RGB: Rgb = (0.86, 0.03, 0.07)
 POINT_RGB: Rgb = (0.42, 0.0, 0.02)
+MARK_RGB: Rgb = (0.10, 0.42, 0.62)
+PATH_RGB: Rgb = (0.85, 0.45, 0.05)
 CAMERA_RGB: Rgb = (0.22, 0.27, 0.34)
 AXIS_RGB: tuple[Rgb, Rgb, Rgb] = ((0.84, 0.39, 0.33), (0.27, 0.62, 0.34), (0.25, 0.42, 0.80))
 
 #: Dots of collision points: radius, and the distance below which one stands for all, in pixels of
 #: a picture 1000 high.
 _POINT_RADIUS_PX, _POINT_SPACING_PX = 1.5, 7.0
+
+#: Dots and ways of a simulation: radius, width, and length of an arrow's head, in such pixels, and
+#: the sine below which an arrow points along the line of sight.
+_MARK_RADIUS_PX, _PATH_WIDTH_PX, _HEAD_PX, _END_ON = 1.6, 3.0, 20.0, 0.05
 
 #: A camera is drawn this long, as a share of its distance from the middle of the scene, and of the
 #: distance to the next camera.
@@ -178,6 +184,8 @@ class PaintedScene:
         How long they are drawn.
     floor : Floor
         The plane of the grid.
+    marks : Marks
+        What is drawn over it.
     """
 
     hull: Hull
@@ -186,6 +194,7 @@ class PaintedScene:
     cameras: tuple[Camera, ...]
     camera_m: float
     floor: Floor
+    marks: Marks = field(default_factory=Marks)
 
 
 class Painter(Closing):
@@ -408,6 +417,9 @@ class Painter(Closing):
             points, pixels = points[~np.isnan(pixels[:, 0])], pixels[~np.isnan(pixels[:, 0])]
             shown = points[thinned(pixels, _POINT_SPACING_PX * scale)]
             strokes.dots(shown, _POINT_RADIUS_PX * scale, (*POINT_RGB, 0.9), 1.0)
+        strokes.dots(scene.marks.points_world, _MARK_RADIUS_PX * scale, (*MARK_RGB, 0.75), 0.1)
+        for path in scene.marks.paths_world:
+            _add_path(strokes, path, scene.marks.head_every, scale)
         return strokes
 
     def _draw_strokes(self, layers: "_Layers", strokes: Strokes) -> None:
@@ -424,6 +436,34 @@ class Painter(Closing):
         self._device.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         array.render(moderngl.TRIANGLES)
         self._device.disable(moderngl.BLEND)
+
+
+def _add_path(
+    strokes: Strokes, path_world: NDArray[np.float64], head_every: int, scale: float
+) -> None:
+    """Add a way with arrow heads, which lie in the plane of the picture."""
+    if len(path_world) < 2:
+        return
+    colour: Colour = (*PATH_RGB, 0.95)
+    starts, ends = path_world[:-1], path_world[1:]
+    strokes.lines(starts, ends, _PATH_WIDTH_PX * scale, colour, 0.35)
+    steps = np.arange(len(ends) - 1, -1, -head_every)
+    along = ends[steps] - starts[steps]
+    length_m = np.linalg.norm(along, axis=1)
+    moved = length_m > 0
+    tips, along = ends[steps][moved], along[moved] / length_m[moved, None]
+    view = strokes.view
+    aside = np.cross(along, view.forward)
+    broad = np.linalg.norm(aside, axis=1)
+    seen = broad > _END_ON  # along the line of sight an arrow has no sides
+    tips, along, aside = tips[seen], along[seen], aside[seen] / broad[seen, None]
+    depth_m = (tips - view.eye_world) @ view.forward
+    head_m = (
+        _HEAD_PX * scale * 2 * view.half_extent[1] / strokes.size_px[1] * np.maximum(depth_m, 0.0)
+    )[:, None]
+    back = tips - head_m * along
+    corners = np.stack([tips, back + 0.45 * head_m * aside, back - 0.45 * head_m * aside], axis=1)
+    strokes.faces(corners, colour, 0.35)
 
 
 def _add_camera(strokes: Strokes, camera: Camera, length_m: float, scale: float) -> None:

@@ -16,7 +16,7 @@ from hybridve.calib.files import appearing
 from hybridve.calib.rig import Rig
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import hull_cells
-from hybridve.hull.view.drawn import DrawnObject
+from hybridve.hull.view.drawn import DrawnObject, Marks
 from hybridve.hull.view.labels import (
     INK,
     LABEL_SIZE,
@@ -95,6 +95,7 @@ def draw_picture(
     size_px: tuple[int, int] = (1600, 1000),
     title: str = "",
     caption: str = "",
+    marks: Marks | None = None,
     painter: Painter | None = None,
 ) -> Image:
     """Return the scene from outside.
@@ -118,6 +119,8 @@ def draw_picture(
         Width and height.
     title, caption : str
         Written into the upper left corner.
+    marks : Marks, optional
+        Points and ways that are drawn over it.
     painter : Painter, optional
         Draws it; for many pictures make one and keep it.
 
@@ -141,6 +144,7 @@ def draw_picture(
                 size_px=size_px,
                 title=title,
                 caption=caption,
+                marks=marks,
                 painter=own,
             )
     aspect = size_px[0] / size_px[1]
@@ -165,7 +169,7 @@ def draw_picture(
     view = viewpoint.novel_view(aspect, _depth_range(viewpoint, everything))
     with_cameras = _are_seen(view, rig.centers_world)
     shown = rig.cameras if with_cameras else ()
-    scene = PaintedScene(hull, cells, objects, shown, camera_m, floor)
+    scene = PaintedScene(hull, cells, objects, shown, camera_m, floor, marks or Marks())
     image = painter.paint(scene, view, size_px)
     labels = Labels(image, size_px[1] / 1000)
     _write_text(labels, title, caption, scene)

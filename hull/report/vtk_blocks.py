@@ -1,0 +1,195 @@
+"""Blocks of ``/VTKHDF``: meshes and points, frame after frame, as ParaView and VTK read them.
+
+No numbers stand on points or triangles: of a collection with some, VTK 9.7 shows the first frame
+only. Times are a link into ``/hybridve``.
+
+References
+----------
+VTK file formats, section "VTKHDF format", version 2.2 of the format.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridve.hull.report.result_file import STORED
+
+_VERSION = (2, 2)
+
+#: The kinds of cells of a PolyData, in VTK's order; collision points are vertices.
+_CELLS = ("Vertices", "Lines", "Polygons", "Strips")
+_VERTICES, _POLYGONS = 0, 2
+
+_CHUNK_ROWS = 16_384
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePoints:
+    """Collision points of one object in some frames, sorted by frame.
+
+    Attributes
+    ----------
+    n_points : (F,) int64
+        How many each frame has.
+    xyz_m : (P, 3) float32
+        Metres about the report's local origin.
+    triangle : (P,) uint32
+        The triangle that each lies on.
+    """
+
+    n_points: NDArray[np.int64]
+    xyz_m: NDArray[np.float32]
+    triangle: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Collection:
+    """The root of a collection, which blocks are added to."""
+
+    root: h5py.Group
+    assembly: h5py.Group
+
+    def block(self, label: str, name: str) -> h5py.Group:
+        """Return a new block, PolyData, of an object of this name."""
+        block = self.root.create_group(label)
+        block.attrs["Index"] = len(self.assembly)
+        block.attrs["object"] = name
+        declare(block, "PolyData")
+        self.assembly[label] = h5py.SoftLink(f"/VTKHDF/{label}")
+        return block
+
+
+def make_collection(file: h5py.File) -> Collection:
+    """Return the new and empty collection of a file."""
+    root = file.create_group("VTKHDF", track_order=True)
+    declare(root, "PartitionedDataSetCollection")
+    return Collection(root, root.create_group("Assembly", track_order=True))
+
+
+def labels_of(names: Sequence[str]) -> list[str]:
+    """Return names that VTK takes for nodes of an assembly, all different."""
+    labels: list[str] = []
+    taken: set[str] = {"Assembly"}
+    for name in names:
+        label = plain = re.sub(r"^(?![A-Za-z_])", "_", re.sub(r"[^A-Za-z0-9_.-]", "_", name))
+        number = 1
+        while {label, f"{label}_points"} & taken:
+            number += 1
+            label = f"{plain}.{number}"
+        taken |= {label, f"{label}_points"}
+        labels.append(label)
+    return labels
+
+
+def declare(group: h5py.Group, kind: str) -> None:
+    """Say that a group is of a kind of VTK's."""
+    group.attrs["Version"] = _VERSION
+    # VTK reads a fixed-length ASCII string only.
+    group.attrs.create("Type", kind.encode(), dtype=h5py.string_dtype("ascii", len(kind)))
+
+
+def add_surface(
+    block: h5py.Group,
+    faces: NDArray[np.int32],
+    vertices_at: Callable[[int], NDArray[np.floating]],
+    n_frames: int,
+    *,
+    moves: bool,
+) -> None:
+    """Add a mesh that every frame shows where it stood; of one that moves, a row of points each.
+
+    `vertices_at` gives the vertices (V, 3) in a frame, metres about the file's local origin; of a
+    mesh that does not move only those of frame 0 are asked for.
+    """
+    n_triangles = len(faces)
+    points = _growing(block, "Points", (3,), np.float32)
+    n_vertices = 0
+    for row in range(n_frames if moves else 1):
+        vertices_m = vertices_at(row)
+        n_vertices = len(vertices_m)
+        _append(points, vertices_m.astype(np.float32))
+    every = np.ones(n_frames, np.int64)
+    _store(block, "NumberOfPoints", n_vertices * every)
+    for number, kind in enumerate(_CELLS):
+        n_cells = n_triangles if number == _POLYGONS else 0
+        _store(block, f"{kind}/NumberOfCells", n_cells * every)
+        _store(block, f"{kind}/NumberOfConnectivityIds", 3 * n_cells * every)
+        _store(block, f"{kind}/Offsets", 3 * np.arange(n_cells + 1, dtype=np.int64))
+        corners = faces.ravel() if n_cells else faces.ravel()[:0]
+        _append(_growing(block, f"{kind}/Connectivity", (), np.int64), corners.astype(np.int64))
+    steps = _add_steps(block, n_frames)
+    _store(steps, "PartOffsets", 0 * every)
+    _store(steps, "PointOffsets", n_vertices * np.arange(n_frames) * int(moves))
+    _store(steps, "CellOffsets", np.zeros((n_frames, len(_CELLS)), np.int64))
+    _store(steps, "ConnectivityIdOffsets", np.zeros((n_frames, len(_CELLS)), np.int64))
+
+
+def add_points(block: h5py.Group, parts: Iterable[FramePoints]) -> None:
+    """Add points, some frames at a time."""
+    points = _growing(block, "Points", (3,), np.float32)
+    connectivity = _growing(block, "Vertices/Connectivity", (), np.int64)
+    counts = [np.zeros(0, np.int64)]
+    for part in parts:
+        counts.append(part.n_points)
+        _append(points, part.xyz_m)
+        starts = np.repeat(_before(part.n_points), part.n_points)
+        _append(connectivity, np.arange(len(starts)) - starts)  # 0, 1, ... within each frame
+    n_points = np.concatenate(counts)
+    # One poly-vertex holds all points of a frame; a frame without points has no cell.
+    n_cells = (n_points > 0).astype(np.int64)
+    none = np.zeros_like(n_points)
+    offsets = np.column_stack([none, n_points])[
+        np.column_stack([np.ones(len(n_points), np.bool_), n_points > 0])
+    ]
+    _store(block, "NumberOfPoints", n_points)
+    for number, kind in enumerate(_CELLS):
+        is_vertices = number == _VERTICES
+        _store(block, f"{kind}/NumberOfCells", n_cells if is_vertices else none)
+        _store(block, f"{kind}/NumberOfConnectivityIds", n_points if is_vertices else none)
+        _store(block, f"{kind}/Offsets", offsets if is_vertices else none)
+        if not is_vertices:
+            _growing(block, f"{kind}/Connectivity", (), np.int64)
+    steps = _add_steps(block, len(n_points))
+    _store(steps, "PartOffsets", np.arange(len(n_points), dtype=np.int64))
+    _store(steps, "PointOffsets", _before(n_points))
+    _store(steps, "CellOffsets", _vertices_only(_before(n_cells)))
+    _store(steps, "ConnectivityIdOffsets", _vertices_only(_before(n_points)))
+
+
+def _add_steps(block: h5py.Group, n_frames: int) -> h5py.Group:
+    steps = block.create_group("Steps")
+    steps.attrs["NSteps"] = n_frames
+    steps["Values"] = h5py.SoftLink("/hybridve/frames/time_s")
+    _store(steps, "NumberOfParts", np.ones(n_frames, np.int64))
+    return steps
+
+
+def _vertices_only(column: NDArray[np.int64]) -> NDArray[np.int64]:
+    table = np.zeros((len(column), len(_CELLS)), np.int64)
+    table[:, _VERTICES] = column
+    return table
+
+
+def _before(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    return (np.cumsum(counts) - counts).astype(np.int64)
+
+
+def _growing(group: h5py.Group, name: str, row: tuple[int, ...], dtype: Any) -> h5py.Dataset:
+    return group.create_dataset(
+        name, (0, *row), dtype, chunks=(_CHUNK_ROWS, *row), maxshape=(None, *row), **STORED
+    )
+
+
+def _append(dataset: h5py.Dataset, rows: NDArray[Any]) -> None:
+    start = len(dataset)
+    dataset.resize(start + len(rows), axis=0)
+    dataset[start:] = rows
+
+
+def _store(group: h5py.Group, name: str, data: NDArray[np.int64]) -> None:
+    group.create_dataset(name, data=data, chunks=True, **STORED)
