@@ -197,6 +197,7 @@ class Simulation:
     def run(
         self,
         *,
+        frames: Generator[FrameHull] | None = None,
         skip: int = 0,
         state: Mapping[str, NDArray[Any]] | None = None,
         progress: Callable[[str, int, int], None] | None = None,
@@ -205,6 +206,8 @@ class Simulation:
 
         Parameters
         ----------
+        frames : generator of FrameHull, optional
+            The recording's, where they are at hand; by default they are read.
         skip : int
             How many frames at the start are done already. The last of them is looked at again.
         state : mapping, optional
@@ -223,7 +226,9 @@ class Simulation:
         before: FrameHull | None = None
         is_still = not self.chain.tracks
         witness = Witness.of(self.chain.views, self.chain.undistortions, None, is_still=is_still)
-        with closing(hulls(self.chain, skip=first, progress=progress)) as frames:
+        if frames is None:
+            frames = hulls(self.chain, skip=first, progress=progress)
+        with closing(frames):
             for frame in frames:
                 seen, outlines = self._judged(frame, witness)
                 if row >= skip:

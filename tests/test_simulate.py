@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from helpers import toy_effect
 from helpers.sessions import BALL_RADIUS_M, write_ball_session, write_cube_scene
 
 from hybridve.hull.report.simulation_file import read_simulation
+from hybridve.hull.report.simulation_sweep import read_simulation_sweep
 
 Run = Callable[..., int]
 
@@ -292,3 +294,55 @@ def test_detect_touches_nothing_of_effects(
     assert ("names effects (dwell), which detect leaves alone" in done.stderr) is has_effects
     with h5py.File(path) as file:
         assert "effects" not in file["hybridve"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("toy")
+def test_a_sweep_of_a_simulation_is_told_written_and_drawn(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "sweep.h5"
+    common = ("sweep", session, "--scene", scene, "-o", path, "--over", "step", "--repeats", 2)
+
+    assert run(*common, "--step-ms", "2,10,40", "--frames", ":6", "--json") == 0
+
+    told = json.loads(capsys.readouterr().out)
+    assert [row["value"] for row in told["rows"]] == [0.002, 0.01, 0.04]
+    assert (told["chosen"], told["finest"]) == (0.002, 0.002)
+    assert all(row["ms_median"] > 0 for row in told["rows"])
+    # The toy stands still and has no energy: nothing is lost by longer steps.
+    assert all(row["distance_max_m"] == row["excess_j"] == 0 for row in told["rows"])
+    kept = read_simulation_sweep(path)
+    assert kept.time_s.shape == (3, 2)
+    assert kept.settings["n_frames"] == 6
+    assert (tmp_path / "sweep.png").stat().st_size > 1000
+    assert run(*common, "--step-ms", "2") == 1  # it is there already
+    assert run(*common, "--step-ms", "2", "--overwrite") == 2
+    assert "one value makes no sweep" in capsys.readouterr().err
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+@pytest.mark.usefixtures("toy")
+def test_a_simulation_is_drawn_as_picture_and_film(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim, film, picture = (tmp_path / name for name in ("sim.h5", "sim.mp4", "sim.png"))
+    assert run("simulate", session, "--scene", scene, "-o", sim, "--frames", "4:9:2") == 0
+    common = ("render", session, "--scene", scene, "--sim", sim, "-o")
+
+    assert run(*common, film) == 0
+    assert run(*common, picture, "--frame", 6) == 0
+    assert run(*common, tmp_path / "no.png", "--frame", 7) == 1
+    assert "has no frame 7" in capsys.readouterr().err
+
+    frames = cv2.VideoCapture(str(film))
+    assert frames.get(cv2.CAP_PROP_FPS) == pytest.approx(12.5)
+    shown = 0
+    while frames.read()[0]:
+        shown += 1
+    assert shown == 3
+    assert cv2.imread(str(picture)).shape == (1000, 1600, 3)
+    other = write_cube_scene(tmp_path / "other", {"box": (0, 0, 0)})
+    assert run("render", session, "--scene", other, "--sim", sim, "-o", tmp_path / "o.png") == 1
+    assert "another scene" in capsys.readouterr().err

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridve.hull.report.simulation_sweep import SimulationSweep
 from hybridve.hull.report.sweep_data import Sweep
 from hybridve.hull.view.chart import Curve, write_chart
+from hybridve.hull.view.simulation_sweep_chart import CostCurve, write_cost
 
 
 def write_picture_of(path: Path, sweep: Sweep) -> None:
@@ -50,3 +52,38 @@ def write_picture_of(path: Path, sweep: Sweep) -> None:
     elif most := max(int(engine.objects_missed.max()) for engine in sweep.engines):
         note = f"distances leave out objects missed altogether: {most} at most, over all frames"
     write_chart(path, curves, rows.labels[-1], title=title, subtitle=sweep.run.machine, note=note)
+
+
+def write_simulation_picture(path: Path, sweep: SimulationSweep) -> None:
+    """Draw what a step, or a viewport, costs a simulation.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written.
+    """
+    settings = sweep.settings
+    is_step = settings["over"] == "step"
+    order = np.argsort(sweep.value)
+    values = sweep.value[order]
+    low_s, median_s, high_s = np.percentile(sweep.time_s[order], (25, 50, 75), axis=1)
+    curve = CostCurve(
+        labels=tuple(f"{1e3 * value:g} ms" if is_step else f"{value:g}" for value in values),
+        time_ms=1e3 * median_s,
+        time_range_ms=1e3 * np.stack([low_s, high_s]),
+        penetration_mm=1e3 * sweep.penetration_m[order],
+        excess_percent=100 * sweep.excess_share[order],
+        distance_mm=1e3 * sweep.distance_max_m[order],
+        on_front=sweep.on_front[order],
+        is_chosen=np.isclose(values, settings["chosen"], rtol=1e-9, atol=0.0),
+    )
+    name = Path(settings["session"]).resolve().parent.name
+    chosen = "the step of `simulate`" if is_step else "the paper's viewport"
+    what = "step" if is_step else "viewport"
+    write_cost(
+        path,
+        curve,
+        chosen,
+        title=f"{name}: {', '.join(settings['effects'])}, {settings['n_frames']} frames, by {what}",
+        note=sweep.run.machine,
+    )
