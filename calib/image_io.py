@@ -2,12 +2,19 @@
 
 A source is named as users name it: the path of a video, or a glob of images. Globs sort as people
 count (2.png before 10.png). Memory does not grow with the length of a recording.
+
+Pixels are the sensor's own: a tag in a file that says how to turn the picture for a viewer (EXIF of
+stills, rotation of videos) turns nothing here, since a lens has no up. Pictures of 16 bits are
+brought to 8 by the bits that hold something: sensors of 10, 12 and 14 bits leave the upper ones
+empty.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +22,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
 
-Image = NDArray[np.uint8]
+Image = NDArray[Any]  # uint8, or as it is stored
 
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 
@@ -44,11 +51,17 @@ class FrameSource:
         One video, or one image a frame.
     is_video : bool
         Whether `paths` is one video.
+    is_raw : bool
+        Whether images are given as they are stored: (H, W) or (H, W, 3 or 4), 8 or 16 bits.
+    bits : int
+        How many bits of images of 16 hold something; see `significant_bits`.
     """
 
     label: str
     paths: tuple[Path, ...]
     is_video: bool
+    is_raw: bool = False
+    bits: int = 16
 
     def claimed_length(self) -> int:
         """Return how many frames there should be; for a video what its header says.
@@ -83,7 +96,7 @@ class FrameSource:
             yield from self._video_frames(start, stop, step)
             return
         for path in self.paths[start:stop:step]:
-            yield read_image(path)
+            yield self.image(path)
 
     def frames_or_errors(
         self, start: int = 0, stop: int | None = None, step: int = 1
@@ -94,9 +107,19 @@ class FrameSource:
             return
         for path in self.paths[start:stop:step]:
             try:
-                yield read_image(path)
+                yield self.image(path)
             except SessionError as error:
                 yield error
+
+    def image(self, path: Path) -> Image:
+        """Return one of its images, as `frames` gives it.
+
+        Raises
+        ------
+        SessionError
+            If it cannot be read.
+        """
+        return read_raw(path) if self.is_raw else read_image(path, self.bits)
 
     def _video_frames(self, start: int, stop: int | None, step: int) -> Iterator[Image]:
         video = _open_video(self.paths[0], self.label)
@@ -160,22 +183,93 @@ def open_source(root: Path, name: str) -> FrameSource:
     return FrameSource(name, (path,), is_video)
 
 
-def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> Image:
-    """Return an image, BGR (H, W, 3) unless `flags` ask for something else.
+def read_image(path: Path, bits: int = 16) -> NDArray[np.uint8]:
+    """Return an image, (H, W, 3) uint8 BGR.
+
+    Of an image of 16 bits the eight below and with bit number `bits` are taken.
 
     Raises
     ------
     SessionError
-        If the file is not an image.
+        If the file is not an image, or has larger values than `bits` hold.
     """
+    if bits == 16:
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        return np.asarray(_decoded(path, flags), np.uint8)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = _decoded(path, flags)
+    if image.dtype != np.uint16:
+        return np.asarray(image, np.uint8)
+    if (most := int(image.max())) >= 1 << bits:
+        raise SessionError(
+            f"{path}: has the value {most}, the pictures looked at first none above "
+            f"{(1 << bits) - 1}, which is {bits} bits; give pictures of one depth"
+        )
+    return (image >> (bits - 8)).astype(np.uint8)
+
+
+def read_raw(path: Path) -> Image:
+    """Return an image as it is stored, (H, W) or (H, W, 3 or 4), 8 or 16 bits, BGR and alpha.
+
+    Raises
+    ------
+    SessionError
+        If the file is not an image, or one of other numbers.
+    """
+    image = _decoded(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise SessionError(f"{path}: holds {image.dtype} values, expected 8 or 16 bits")
+    return image
+
+
+def _decoded(path: Path, flags: int) -> Image:
     image = cv2.imread(str(path), flags)
     if image is None:
         raise SessionError(f"{path}: not an image that can be read")
-    return np.asarray(image, np.uint8)
+    return image
+
+
+#: Depths of sensors that write files of 16 bits.
+_DEPTHS = (10, 12, 14, 16)
+
+#: Endings of files that may hold 16 bits.
+_DEEP_SUFFIXES = {".png", ".tif", ".tiff", ".pgm", ".ppm"}
+
+
+def significant_bits(sources: Iterable[FrameSource]) -> int:
+    """Return how many bits of the images of some sources hold something: 10, 12, 14 or 16.
+
+    The first, the middle and the last image of each are looked at; 16 where none has 16 bits. A
+    dark picture of more bits than it fills is as well told by fewer, as long as all pictures of a
+    camera are read alike.
+    """
+    most = 0
+    for source in sources:
+        if source.is_video or source.paths[0].suffix.lower() not in _DEEP_SUFFIXES:
+            continue
+        for path in {source.paths[0], source.paths[len(source.paths) // 2], source.paths[-1]}:
+            if _is_shallow_png(path):
+                continue
+            with suppress(SessionError):  # said when its turn comes
+                image = read_raw(path)
+                if image.dtype == np.uint16:
+                    most = max(most, int(image.max()))
+    return 16 if most == 0 else next(bits for bits in _DEPTHS if most < 1 << bits)
+
+
+def _is_shallow_png(path: Path) -> bool:
+    """Tell whether a file is a PNG of 8 bits or fewer, from its first bytes."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(25)
+    except OSError:
+        return False
+    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24] <= 8
 
 
 def _open_video(path: Path, label: str) -> cv2.VideoCapture:
     video = cv2.VideoCapture(str(path))
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     if not video.isOpened():
         raise SessionError(f"{label}: {path} is not a video that can be read")
     # Frames are small and cameras are read side by side: one decoding thread each is quickest.

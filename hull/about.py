@@ -36,6 +36,7 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "unseen": session.unseen,
         "min_cameras": session.min_cameras,
         "mask_threshold": session.mask_threshold,
+        "mask_channel": session.mask_channel,
         "rig_check": session.rig_check,
         "segmentation": asdict(session.segmentation),
         "silhouettes": None if chain.silhouettes is None else str(chain.silhouettes),

@@ -20,6 +20,7 @@ from hybridve.hull.agreement.told import brief
 from hybridve.hull.capture.recording import (
     FrameRange,
     as_recorded,
+    mask_reading,
     recording_of,
     segmented_frames,
     undistort_mask,
@@ -204,9 +205,19 @@ def _undistorted(chain: Chain, masks: list[NDArray[np.uint8]]) -> list[NDArray[n
 
 
 def _images(session: Session, camera: SessionCamera, index: int) -> Iterator[Image]:
-    """Yield the image that a camera recorded at a frame, (H, W, 3)."""
+    """Yield the image that a camera recorded at a frame, (H, W, 3); of ready masks, what is object.
+
+    Masks may be of any values; what they are in colours, if they are in colours, is shown as it is.
+    """
     number = index - camera.shift_frames
-    yield from recording_of(session, camera).frames(number, number + 1)
+    for image in recording_of(session, camera).frames(number, number + 1):
+        if not camera.has_masks:
+            yield image
+        elif image.ndim == 3 and image.dtype == np.uint8:
+            yield np.ascontiguousarray(image[..., :3])
+        else:
+            mask = mask_reading(session, camera).mask(image)
+            yield np.repeat(mask[..., None] * np.uint8(255), 3, axis=2)
 
 
 def _title(chain: Chain, index: int) -> str:

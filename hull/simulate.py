@@ -379,6 +379,7 @@ _KEPT = (
     "unseen",
     "min_cameras",
     "mask_threshold",
+    "mask_channel",
     "rig_check",
     "segmentation",
     "silhouettes",

@@ -86,7 +86,7 @@ def forbid(patch: pytest.MonkeyPatch) -> None:
         raise AssertionError("a picture was decoded")
 
     patch.setattr(FrameSource, "frames", decode)
-    patch.setattr(search, "read_image", decode)
+    patch.setattr(FrameSource, "image", decode)
     patch.setattr(cv2, "imread", decode)
 
 

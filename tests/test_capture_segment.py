@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SessionError
 from hybridve.calib.image_io import FrameSource, open_source, read_image
 from hybridve.hull.capture.background import Background, learn_background
-from hybridve.hull.capture.segment import Segmenter, SegmentSettings, clean, threshold_mask
+from hybridve.hull.capture.segment import Segmenter, SegmentSettings, clean
 
 _FEW = settings(max_examples=20)
 
@@ -424,18 +424,6 @@ def test_specks_go_small_holes_close_and_a_ring_stays_a_ring() -> None:
     assert_boundary_within(mask, truth | disc)
 
 
-@pytest.mark.parametrize("threshold", [127, 48])
-def test_a_ready_mask_is_what_is_brighter_than_the_threshold(threshold: int) -> None:
-    levels = np.arange(256, dtype=np.uint8)[None]
-    coloured = np.stack([levels, np.zeros_like(levels), levels // 2], axis=2)
-
-    for image in (levels, coloured):
-        mask = threshold_mask(image, threshold)
-
-        assert mask.dtype == np.uint8
-        np.testing.assert_array_equal(mask, levels > threshold)
-
-
 def background_of(source: FrameSource) -> Background:
     return learn_background(source.frames())
 
@@ -461,7 +449,7 @@ def test_the_horseman_is_as_painted_by_hand(recordings: Path, horseman_masks: li
     scores = []
     for camera, mask in enumerate(horseman_masks, start=1):
         path = recordings / "horseman" / "manual_masks" / f"manual_mask_{camera}.jpg"
-        painted = read_image(path, cv2.IMREAD_GRAYSCALE) > 127
+        painted = read_image(path)[..., 0] > 127
         found = mask > 0
         if camera == 3:
             # A board and the chair that it leans on stand here in the recording, but not in the
@@ -489,7 +477,7 @@ def test_cars_on_a_highway_are_told_from_their_shadows(recordings: Path) -> None
     segmenter = Segmenter(learn_background(frames(range(1, 466, 8))), SegmentSettings())
     hits = false_alarms = misses = 0
     for index, image in zip(range(900, 1100), frames(range(900, 1100)), strict=True):
-        truth = read_image(root / "groundtruth" / f"gt{index:06d}.png", cv2.IMREAD_GRAYSCALE)
+        truth = read_image(root / "groundtruth" / f"gt{index:06d}.png")[..., 0]
         judged = (truth != 85) & (truth != 170)  # outside the region, unknown
         moving, found = truth == 255, segmenter.segment(image) > 0
         hits += int((moving & found & judged).sum())

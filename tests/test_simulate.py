@@ -342,7 +342,9 @@ def test_a_simulation_is_drawn_as_picture_and_film(
     while frames.read()[0]:
         shown += 1
     assert shown == 3
-    assert cv2.imread(str(picture)).shape == (1000, 1600, 3)
+    drawn = cv2.imread(str(picture))
+    assert drawn is not None
+    assert drawn.shape == (1000, 1600, 3)
     other = write_cube_scene(tmp_path / "other", {"box": (0, 0, 0)})
     assert run("render", session, "--scene", other, "--sim", sim, "-o", tmp_path / "o.png") == 1
     assert "another scene" in capsys.readouterr().err

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Detection, Effort
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.image_io import FrameSource, read_image
+from hybridve.calib.image_io import FrameSource
 from hybridve.calib.seeing.corner_cache import Answer, CornerCache
 from hybridve.calib.seeing.inputs import ObserveSettings, Progress
 
@@ -105,12 +105,13 @@ def describe_board(board: Board) -> str:
 
 @cache
 def _digest_of_code(files: frozenset[Path]) -> str:
-    """Return a digest of a board's sources and of all that looks for boards.
+    """Return a digest of a board's sources and of all that reads pictures and looks for boards.
 
     What another version finds may differ.
     """
     here = Path(__file__).parent
-    ours = [path for room in (here, here.parent / "boards") for path in room.glob("*.py")]
+    rooms = (here, here.parent / "boards")
+    ours = [here.parent / "image_io.py", *(path for room in rooms for path in room.glob("*.py"))]
     digest = hashlib.sha256()
     for path in sorted(files.union(ours)):
         with suppress(OSError):
@@ -263,7 +264,7 @@ def search_pictures(
             path = source.paths[index]
             picture: Key = ("picture", search.identify([path], source.label), 0)
             if recall(index, picture) != []:
-                look(index, picture, read_image(path))
+                look(index, picture, source.image(path))
             search.report(what, number, total)
         collect(0)
     search.report(what, total, total)  # a video may end before its header says

@@ -6,6 +6,7 @@ length of the recording.
 """
 
 import json
+import logging
 import queue
 import threading
 import time
@@ -25,15 +26,21 @@ from hybridve.calib.errors import SessionError
 from hybridve.calib.image_io import FrameSource, Image
 from hybridve.calib.lens import Undistortion, cam_from_img
 from hybridve.hull.capture.background import learn_background
-from hybridve.hull.capture.segment import METHOD_VERSION, Segmenter, threshold_mask
+from hybridve.hull.capture.mask_values import MASK_METHOD, MaskReading, reading_of
+from hybridve.hull.capture.segment import METHOD_VERSION, Segmenter
 from hybridve.hull.capture.session import Session, SessionCamera
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
 from hybridve.hull.capture.tracks import Tracks
+
+_log = logging.getLogger(__name__)
 
 Mask = NDArray[np.uint8]
 
 #: How many frames a camera is read ahead: enough to smooth out a slow frame.
 _READ_AHEAD = 3
+
+#: Ready masks that are looked at to find out what their values mean.
+_MOST_LOOKED_AT = 12
 
 #: How far apart, in recorded pixels, a lens is asked where a mask is bent as it bends.
 _LENS_STEP_PX = 8
@@ -296,7 +303,7 @@ def silhouette_stamp(session: Session, rig_digest: str | None) -> str:
         {
             "method": METHOD_VERSION,
             "segmentation": asdict(session.segmentation),
-            "mask_threshold": session.mask_threshold,
+            "masks": [session.mask_threshold, session.mask_channel, MASK_METHOD],
             "rig": rig_digest,
             "shift_frames": [camera.shift_frames for camera in session.cameras],
             "files": files,
@@ -367,10 +374,53 @@ def _mask_source(session: Session, camera: SessionCamera) -> FrameSource:
     return recording
 
 
+def mask_reading(session: Session, camera: SessionCamera) -> MaskReading:
+    """Return how the ready masks of a camera are read, found from some of them.
+
+    Raises
+    ------
+    SessionError
+        If that cannot be told.
+    """
+    source = recording_of(session, camera)
+    try:
+        reading = reading_of(_looked_at(source), session.mask_threshold, session.mask_channel)
+    except ValueError as error:
+        raise SessionError(
+            f"{session.path}: camera {camera.name!r}: {source.label!r}: {error}"
+        ) from error
+    _log.info(
+        "camera %s: pixels of masks above %d are object (%s, up to %d)",
+        camera.name,
+        reading.above,
+        reading.channel,
+        reading.most,
+    )
+    return reading
+
+
+def _looked_at(source: FrameSource) -> list[Image]:
+    """Return some masks with something in them, spread over a recording where that is cheap."""
+    n_frames = max(source.claimed_length(), 1)
+    step = 1 if source.is_video else -(-n_frames // _MOST_LOOKED_AT)
+    some: list[Image] = []
+    starts = (0,) if step == 1 else range(step)  # those between where the first show nothing
+    for start in starts:
+        for image in source.frames_or_errors(start, None, step):
+            if isinstance(image, SessionError):
+                continue
+            if not some or image.any():
+                some.append(image)
+            if len(some) > _MOST_LOOKED_AT:
+                return some
+        if any(image.any() for image in some):
+            return some
+    return some
+
+
 def _make_cutter(session: Session, camera: SessionCamera) -> Callable[[Image], Mask]:
     if camera.has_masks or camera.background is None:
-        threshold = session.mask_threshold
-        return lambda image: threshold_mask(image, threshold)
+        return mask_reading(session, camera).mask
     segmenter = Segmenter(learn_background(camera.background.frames()), session.segmentation)
     return segmenter.segment
 
@@ -476,7 +526,11 @@ class _Lane(threading.Thread):
                     decoded - started,
                 )
                 continue
-            mask = self._cut(image)
+            try:
+                mask = self._cut(image)
+            except ValueError as error:
+                yield _Cut(None, f"camera {self._camera.name!r}: {error}", decoded - started)
+                continue
             if self._undistortion is not None:
                 mask = undistort_mask(mask, self._undistortion)
             yield _Cut(mask, "", decoded - started, time.thread_time() - decoded)

@@ -266,12 +266,6 @@ def clean(mask: NDArray[np.uint8], speck_px: int, hole_px: int) -> NDArray[np.ui
     return result
 
 
-def threshold_mask(image: Image, threshold: int = 127) -> NDArray[np.uint8]:
-    """Return 1 where a ready mask, grey or coloured, is brighter than `threshold`."""
-    grey = image if image.ndim == 2 else image.max(axis=2)
-    return (grey > threshold).view(np.uint8)
-
-
 @compiled
 def _flip_small(
     mask: NDArray[np.uint8],

@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from hybridve.calib.errors import SessionError
-from hybridve.calib.image_io import FrameSource, open_source
+from hybridve.calib.image_io import FrameSource, open_source, significant_bits
 from hybridve.hull.capture.segment import SegmentSettings
 from hybridve.hull.capture.session_tables import (
     TARGETS,
@@ -123,8 +123,11 @@ class Session:
     rig_check : str
         Whether a rig that is used is tested against the boards that the cameras saw, and the
         cameras for having moved since: "on", or "off" where it is to be used whatever they say.
-    mask_threshold : int
-        Pixels of ready masks above it are object pixels.
+    mask_threshold : int or None
+        Pixels of ready masks above so many 255ths of the full scale are object pixels; None to
+        find it out from the masks.
+    mask_channel : str or None
+        Whether ready masks are in the grey levels or in the alpha channel; None to find it out.
     segmentation : SegmentSettings
         How objects are told from the background.
     cameras : tuple of SessionCamera
@@ -144,7 +147,8 @@ class Session:
     sync: Literal["given", "estimate"]
     rig_file: RigFile | None
     rig_check: Literal["on", "off"]
-    mask_threshold: int
+    mask_threshold: int | None
+    mask_channel: Literal["grey", "alpha"] | None
     segmentation: SegmentSettings
     cameras: tuple[SessionCamera, ...]
     checksum: str
@@ -235,6 +239,7 @@ def load_session(path: Path) -> Session:
         rig_file=rig_file,
         rig_check=parsed.rig_check,
         mask_threshold=parsed.mask_threshold,
+        mask_channel=parsed.mask_channel,
         segmentation=_segment_settings(parsed.segmentation, path),
         cameras=tuple(
             _find_files(camera, number, shared_params, root, parsed.fps, path)
@@ -360,6 +365,11 @@ def _segment_settings(table: dict[str, Any], path: Path) -> SegmentSettings:
         raise SessionError(f"{path}: segmentation: {error}") from None
 
 
+def _as_stored(source: FrameSource | None) -> FrameSource | None:
+    """Return masks as what their files hold; what that means is found from them."""
+    return None if source is None else replace(source, is_raw=True)
+
+
 def _find_files(
     table: CameraTable,
     number: int,
@@ -388,14 +398,19 @@ def _find_files(
             )
         return file
 
+    pictures = {key: find(key) for key in ("intrinsics", "extrinsics", "background", "video")}
+    bits = significant_bits(source for source in pictures.values() if source is not None)
+    intrinsics, extrinsics, background, video = (
+        None if source is None else replace(source, bits=bits) for source in pictures.values()
+    )
     return SessionCamera(
         name=table.name,
         model=table.model,
-        intrinsics=find("intrinsics"),
-        extrinsics=find("extrinsics"),
+        intrinsics=intrinsics,
+        extrinsics=extrinsics,
         corners=find_file("corners"),
-        background=find("background"),
-        recording=find("masks") if table.masks is not None else find("video"),
+        background=background,
+        recording=video if table.masks is None else _as_stored(find("masks")),
         has_masks=table.masks is not None,
         shift_frames=round(table.offset_s * fps),
         lens=table.lens,

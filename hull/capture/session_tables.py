@@ -263,7 +263,8 @@ class SessionTable(_Table):
     rig_pixel_centre: float = 0.5
     rig_check: Literal["on", "off"] = "on"
     point: list[WorldPoint] = []
-    mask_threshold: Annotated[int, Field(ge=0, le=254)] = 127
+    mask_threshold: Annotated[int, Field(ge=0, le=254)] | None = None
+    mask_channel: Literal["grey", "alpha"] | None = None
     segmentation: dict[str, Any] = {}
     camera: Annotated[list[CameraTable], Field(min_length=1)]
 
