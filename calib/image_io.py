@@ -9,10 +9,12 @@ brought to 8 by the bits that hold something: sensors of 10, 12 and 14 bits leav
 empty.
 """
 
+import itertools
+import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.avi_index import AviFrames, avi_frames
 from hybridve.calib.errors import SessionError
 
 Image = NDArray[Any]  # uint8, or as it is stored
@@ -55,6 +58,9 @@ class FrameSource:
         Whether images are given as they are stored: (H, W) or (H, W, 3 or 4), 8 or 16 bits.
     bits : int
         How many bits of images of 16 hold something; see `significant_bits`.
+    slots : tuple of int
+        Of images that are numbered, which of `paths` each frame is, -1 where there is none; empty
+        if each path is a frame. See `in_step`.
     """
 
     label: str
@@ -62,6 +68,14 @@ class FrameSource:
     is_video: bool
     is_raw: bool = False
     bits: int = 16
+    slots: tuple[int, ...] = ()
+
+    @property
+    def pictures(self) -> tuple[Path | None, ...]:
+        """Of images, the file of each frame; None where there is none."""
+        if not self.slots:
+            return self.paths
+        return tuple(None if slot < 0 else self.paths[slot] for slot in self.slots)
 
     def claimed_length(self) -> int:
         """Return how many frames there should be; for a video what its header says.
@@ -69,45 +83,67 @@ class FrameSource:
         Headers are often a frame or two off: only reading tells.
         """
         if not self.is_video:
-            return len(self.paths)
+            return len(self.pictures)
         video = _open_video(self.paths[0], self.label)
         length = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         video.release()
         return length
 
-    def count(self) -> int:
-        """Return how many frames can be read, by reading them."""
+    def rate(self) -> float | None:
+        """Return how many frames a second a video says it has; None if it does not say."""
         if not self.is_video:
-            return len(self.paths)
+            return None
         video = _open_video(self.paths[0], self.label)
-        length = 0
-        while video.grab():
-            length += 1
+        rate = float(video.get(cv2.CAP_PROP_FPS))
         video.release()
-        return length
+        return rate if _LEAST_RATE <= rate <= _MOST_RATE else None
+
+    def count(self) -> int:
+        """Return how many frames there are, by reading them; damaged ones among others count."""
+        if not self.is_video:
+            return len(self.pictures)
+        return sum(1 for _ in self._video_frames(0, None, 1, decode=False))
 
     def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Image]:
         """Yield (H, W, 3) uint8 BGR frames `start`, `start + step`, ... before `stop`.
 
-        Ends early, without an error, where the source ends; an image that cannot be read ends it
-        with a `SessionError`.
+        Ends early, without an error, where the source ends; frames that are missing or damaged are
+        left out, but an image that cannot be read ends it with a `SessionError`.
         """
+        for _, image in self.numbered_frames(start, stop, step):
+            yield image
+
+    def numbered_frames(
+        self, start: int = 0, stop: int | None = None, step: int = 1
+    ) -> Iterator[tuple[int, Image]]:
+        """Yield what `frames` does, each with its number."""
         if self.is_video:
-            yield from self._video_frames(start, stop, step)
+            for number, image in enumerate(self._video_frames(start, stop, step)):
+                if not isinstance(image, SessionError):
+                    yield start + number * step, image
             return
-        for path in self.paths[start:stop:step]:
-            yield self.image(path)
+        pictures = self.pictures
+        for number in range(*slice(start, stop, step).indices(len(pictures))):
+            path = pictures[number]
+            if path is not None:
+                yield number, self.image(path)
 
     def frames_or_errors(
         self, start: int = 0, stop: int | None = None, step: int = 1
     ) -> Iterator[Image | SessionError]:
-        """Yield what `frames` does, with a `SessionError` in the place of a damaged image."""
+        """Yield all frames, with a `SessionError` in the place of a missing or damaged one."""
         if self.is_video:
             yield from self._video_frames(start, stop, step)
             return
-        for path in self.paths[start:stop:step]:
+        pictures = self.pictures
+        for number in range(*slice(start, stop, step).indices(len(pictures))):
+            path = pictures[number]
             try:
-                yield self.image(path)
+                yield (
+                    SessionError(f"{self.label}: there is no picture of frame {number}")
+                    if path is None
+                    else self.image(path)
+                )
             except SessionError as error:
                 yield error
 
@@ -121,35 +157,175 @@ class FrameSource:
         """
         return read_raw(path) if self.is_raw else read_image(path, self.bits)
 
-    def _video_frames(self, start: int, stop: int | None, step: int) -> Iterator[Image]:
+    def _video_frames(
+        self, start: int, stop: int | None, step: int, *, decode: bool = True
+    ) -> Iterator[Image | SessionError]:
+        """Yield the frames of a video, each in its place, whatever is lost before it.
+
+        Reading on is the only seek that every container and codec gets right.
+        """
+        avi = avi_frames(self.paths[0])
+        places = _Places(avi)
         video = _open_video(self.paths[0], self.label)
+        rate = video.get(cv2.CAP_PROP_FPS)
+        index = 0  # the next frame to be yielded
         try:
-            index = 0
-            # Reading on is the only seek that every container and codec gets right.
             while stop is None or index < stop:
-                if index < start or (index - start) % step:
-                    if not video.grab():
-                        return
-                else:
-                    good, image = video.read()
-                    if not good:
-                        return
-                    yield np.asarray(image, np.uint8)
+                is_there = video.grab()
+                at = places.next(video.get(cv2.CAP_PROP_POS_MSEC), rate) if is_there else None
+                end = (avi.n_frames if avi else index) if at is None else at
+                while index < end and (stop is None or index < stop):
+                    if index >= start and (index - start) % step == 0:
+                        yield SessionError(f"{self.label}: frame {index} is lost or damaged")
+                    index += 1
+                if at is None or (stop is not None and index >= stop):
+                    return
+                if index >= start and (index - start) % step == 0:
+                    if avi is not None and index in avi.damaged:
+                        yield SessionError(f"{self.label}: frame {index} is damaged")
+                    elif not decode:
+                        yield _NOTHING
+                    else:
+                        good, image = video.retrieve()
+                        yield (
+                            np.asarray(image, np.uint8)
+                            if good
+                            else SessionError(f"{self.label}: frame {index} cannot be decoded")
+                        )
                 index += 1
         finally:
             video.release()
 
     def first(self) -> Image:
-        """Return the first frame.
+        """Return the first frame that there is.
 
         Raises
         ------
         SessionError
             If there is none.
         """
-        for image in self.frames(stop=1):
+        for image in self.frames():
             return image
         raise SessionError(f"{self.label}: no frame can be read")
+
+
+class _Places:
+    """Where the frames of a video belong that a reader gives one after another.
+
+    The index of an AVI tells which it passes over. Time stamps tell of others: a step of more than
+    one and a half frames is a gap. Stamps that go back, or are not given, tell nothing.
+    """
+
+    def __init__(self, avi: AviFrames | None) -> None:
+        unreachable = frozenset() if avi is None else avi.unreachable
+        self._unreachable = unreachable
+        self._place = -1
+        self._ms: float | None = None
+
+    def next(self, ms: float, rate: float) -> int:
+        """Return the number of the frame that was read, by its time stamp in milliseconds."""
+        gap = 1
+        if self._ms is not None and ms > self._ms and _LEAST_RATE <= rate <= _MOST_RATE:
+            gap = max(1, round((ms - self._ms) * rate / 1e3))
+        if self._ms is None or ms > self._ms:
+            self._ms = ms
+        for _ in range(gap):
+            self._place += 1
+            while self._place in self._unreachable:
+                self._place += 1
+        return self._place
+
+
+#: What stands for a frame that nobody looks at.
+_NOTHING = np.zeros((0, 0, 3), np.uint8)
+
+#: Frames a second that a header may say; others are no rates.
+_LEAST_RATE, _MOST_RATE = 1.0, 1000.0
+
+
+def frame_numbers(paths: Sequence[Path]) -> tuple[int, ...] | None:
+    """Return the numbers in the names of images, if the names differ in one number only.
+
+    Examples
+    --------
+    >>> frame_numbers([Path("cam2_007.png"), Path("cam2_009.png")])
+    (7, 9)
+    >>> frame_numbers([Path("a.png"), Path("b.png")]) is None
+    True
+    """
+    parts = [re.split(r"(\d+)", path.stem) for path in paths]
+    if len(paths) < 2 or len({len(part) for part in parts}) != 1:
+        return None
+    differing = [
+        column
+        for column in range(len(parts[0]))
+        if len({int(part[column]) if column % 2 else part[column] for part in parts}) > 1
+    ]
+    if len(differing) != 1 or differing[0] % 2 == 0:
+        return None
+    numbers = tuple(int(part[differing[0]]) for part in parts)
+    return numbers if len(set(numbers)) == len(numbers) else None
+
+
+def in_step(sources: Sequence[FrameSource]) -> list[FrameSource]:
+    """Return image sources with the images of one instant in one frame, by the numbers in names.
+
+    A picture that one camera lacks is a frame without a picture, and shifts none of the others.
+    Where all sources have as many images, without gaps, or the names do not tell, each path is a
+    frame.
+
+    Raises
+    ------
+    SessionError
+        If some images are missing, and numbers do not tell which.
+    """
+    known = [
+        one
+        for source in sources
+        if not source.is_video and (one := frame_numbers(source.paths)) is not None
+    ]
+    is_even = all(map(_is_even, known)) and len({len(one) for one in known}) <= 1
+    if len(known) < len(sources) or is_even:
+        return list(sources)
+    if not all(_is_one_counter(number, known) for number in range(len(known))):
+        ranges = ", ".join(
+            f"{source.label} {min(one)} to {max(one)}"
+            for source, one in zip(sources, known, strict=True)
+        )
+        raise SessionError(
+            f"pictures are missing, and the numbers in their names do not tell which belong "
+            f"together ({ranges}); number the pictures of one instant alike in all cameras"
+        )
+    every = sorted(set.union(*map(set, known)))
+    stride = math.gcd(*(after - before for before, after in itertools.pairwise(every)))
+    frames: Sequence[int] = range(every[0], every[-1] + 1, stride)
+    if len(frames) > _MOST_GAPS * len(every):  # these are no numbers of frames
+        frames = every
+    found = []
+    for source, one in zip(sources, known, strict=True):
+        place = {number: slot for slot, number in enumerate(one)}
+        found.append(replace(source, slots=tuple(place.get(at, -1) for at in frames)))
+    return found
+
+
+#: Frames that are kept free for pictures that nobody has, for each that somebody has.
+_MOST_GAPS = 4
+
+
+#: The share of a camera's pictures whose numbers others have, too, if they are counted alike.
+_LEAST_SHARED = 0.25
+
+
+def _is_one_counter(number: int, every: Sequence[Sequence[int]]) -> bool:
+    """Tell whether one camera's pictures are numbered as those of others, if there are others."""
+    others = {at for other, one in enumerate(every) if other != number for at in one}
+    shared = len(others.intersection(every[number]))
+    return len(every) == 1 or shared >= _LEAST_SHARED * len(every[number])
+
+
+def _is_even(numbers: Sequence[int]) -> bool:
+    """Tell whether numbers go up in equal steps."""
+    return len({after - before for before, after in itertools.pairwise(sorted(numbers))}) <= 1
 
 
 def open_source(root: Path, name: str) -> FrameSource:

@@ -36,10 +36,10 @@ def given_corners(boards: Sequence[Board], camera: CameraInput) -> Given:
             given.whole[corners.board] = corners.pixels
             continue
         if isinstance(corners.image, int):
-            if not clip.is_video and corners.image >= len(clip.paths):
+            if not clip.is_video and corners.image >= len(clip.pictures):
                 raise CalibrationError(
                     f"{camera.corners}: frame {corners.image}; {clip.label} has "
-                    f"{len(clip.paths)}, from 0"
+                    f"{len(clip.pictures)}, from 0"
                 )
             places = [(given.clip, corners.image)]
         else:
@@ -69,7 +69,11 @@ def _named(source: FrameSource, name: str) -> list[int]:
         number = name.removeprefix("frame ")
         return [int(number)] if number != name and number.isdecimal() else []
     parts = Path(name).parts
-    return [index for index, path in enumerate(source.paths) if path.parts[-len(parts) :] == parts]
+    return [
+        index
+        for index, path in enumerate(source.pictures)
+        if path is not None and path.parts[-len(parts) :] == parts
+    ]
 
 
 def serves_as_stills(camera: CameraInput) -> bool:

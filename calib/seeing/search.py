@@ -144,9 +144,9 @@ class Choice:
     def read_video(self, source: FrameSource) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield the pictures that are looked at, each with its number."""
         step = 1 if self.more else self.step  # frames that are skipped are not decoded
-        for number, image in enumerate(source.frames(step=step)):
-            if self.takes(number * step):
-                yield number * step, image
+        for index, image in source.numbered_frames(step=step):
+            if self.takes(index):
+                yield index, image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,10 +258,13 @@ def search_pictures(
             collect(0)
             search.cache.keep(walk, ({"indices": done}, None))
     else:
-        indices = choice.of(len(source.paths))
+        pictures = source.pictures
+        indices = choice.of(len(pictures))
         total = len(indices)
         for number, index in enumerate(indices, start=1):
-            path = source.paths[index]
+            path = pictures[index]
+            if path is None:  # a view fewer
+                continue
             picture: Key = ("picture", search.identify([path], source.label), 0)
             if recall(index, picture) != []:
                 look(index, picture, source.image(path))
@@ -278,7 +281,7 @@ def length_of(search: Search, source: FrameSource) -> int:
         return {"length": claimed if claimed > 0 else max(1, source.count())}, None
 
     if not source.is_video:
-        return len(source.paths)
+        return len(source.pictures)
     question = ("length", search.identify(source.paths, source.label))
     length: int = search.cache.recall(question, count)[0]["length"]
     return length

@@ -75,11 +75,12 @@ def _names_of_images(source: FrameSource, indices: Iterable[int]) -> dict[int, s
     """Return what to call images: by as little of their paths as tells them apart."""
     if source.is_video:
         return {index: f"frame {index}" for index in sorted(indices)}
-    names = [path.name for path in source.paths]
-    for depth in range(2, max(len(path.parts) for path in source.paths)):
-        if len(set(names)) == len(names):
+    paths = {index: path for index, path in enumerate(source.pictures) if path is not None}
+    names = {index: path.name for index, path in paths.items()}
+    for depth in range(2, max(len(path.parts) for path in paths.values())):
+        if len(set(names.values())) == len(names):
             break
-        names = ["/".join(path.parts[-depth:]) for path in source.paths]
+        names = {index: "/".join(path.parts[-depth:]) for index, path in paths.items()}
     return {index: names[index] for index in sorted(indices)}
 
 

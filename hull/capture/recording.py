@@ -151,12 +151,21 @@ def check_lengths(session: Session, frames: FrameRange) -> None:
     shortest, longest = min(lengths), max(lengths)
     if shortest == longest or (frames.stop is not None and frames.stop <= shortest):
         return
-    number = lengths.index(shortest)
-    key = "masks" if session.cameras[number].has_masks else "video"
+    number, other = lengths.index(shortest), lengths.index(longest)
+    camera = session.cameras[number]
+    label, count = recordings[number].label, f"{shortest} frames"
+    what = (
+        f"{session.path}: camera.{number + 1}.{'masks' if camera.has_masks else 'video'}: "
+        f"{label!r} has {count}, that of camera {session.cameras[other].name!r} {longest}"
+    )
+    if not recordings[number].is_video:
+        raise SessionError(
+            f"{what}, and the names of its pictures do not tell which are missing; number the "
+            "pictures of one instant alike in all cameras"
+        )
     raise SessionError(
-        f"{session.path}: camera.{number + 1}.{key}: {recordings[number].label!r} stops after "
-        f"{shortest} frames, but camera.{lengths.index(longest) + 1} has {longest}; evaluate what "
-        f"all cameras saw with --frames {frames.start}:{shortest}, or record again"
+        f"{what}; record again, or, if it only stopped early and lost no frame before that, "
+        f"evaluate what all cameras saw with --frames {frames.start}:{shortest}"
     )
 
 

@@ -6,6 +6,8 @@ mistake is told before any work starts. Frames themselves are read later, one at
 """
 
 import hashlib
+import logging
+import statistics
 from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -18,7 +20,7 @@ from pydantic import (
 )
 
 from hybridve.calib.errors import SessionError
-from hybridve.calib.image_io import FrameSource, open_source, significant_bits
+from hybridve.calib.image_io import FrameSource, in_step, open_source, significant_bits
 from hybridve.hull.capture.segment import SegmentSettings
 from hybridve.hull.capture.session_tables import (
     TARGETS,
@@ -29,6 +31,11 @@ from hybridve.hull.capture.session_tables import (
     WorldPoint,
 )
 from hybridve.hull.toml_io import expand_root, explain_validation, read_toml
+
+_log = logging.getLogger(__name__)
+
+#: Frames a second where nobody says; and two rates are the same up to this factor.
+_NO_RATE, _SAME_RATE = 30.0, 1.01
 
 #: Points whose triangle is flatter than this (sine of its angles) lie on a line.
 _FLAT = 1e-3
@@ -223,13 +230,27 @@ def load_session(path: Path) -> Session:
         raise SessionError(
             f"{path}: min_cameras: {parsed.min_cameras} of {len(names)} cameras cannot see a point"
         )
+    cameras = _in_step(
+        tuple(
+            _find_files(camera, number, shared_params, root, path)
+            for number, camera in enumerate(parsed.camera, start=1)
+        ),
+        path,
+        # A camera that began later counts from its own beginning.
+        have_own_counters=any(camera.offset_s for camera in parsed.camera),
+    )
+    fps = _rate_of(parsed, cameras, path)
+    cameras = tuple(
+        replace(camera, shift_frames=round(table.offset_s * fps))
+        for camera, table in zip(cameras, parsed.camera, strict=True)
+    )
     rig_file = None
     if parsed.rig is not None:
         rig_file = RigFile(parsed.rig, parsed.rig_unit, parsed.rig_pixel_centre)
     return Session(
         path=path,
         root=root,
-        fps=parsed.fps,
+        fps=fps,
         unseen=parsed.unseen,
         min_cameras=parsed.min_cameras,
         targets=targets,
@@ -241,10 +262,7 @@ def load_session(path: Path) -> Session:
         mask_threshold=parsed.mask_threshold,
         mask_channel=parsed.mask_channel,
         segmentation=_segment_settings(parsed.segmentation, path),
-        cameras=tuple(
-            _find_files(camera, number, shared_params, root, parsed.fps, path)
-            for number, camera in enumerate(parsed.camera, start=1)
-        ),
+        cameras=cameras,
         checksum=hashlib.sha256(text).hexdigest(),
     )
 
@@ -365,6 +383,81 @@ def _segment_settings(table: dict[str, Any], path: Path) -> SegmentSettings:
         raise SessionError(f"{path}: segmentation: {error}") from None
 
 
+def _in_step(
+    cameras: tuple[SessionCamera, ...], path: Path, *, have_own_counters: bool
+) -> tuple[SessionCamera, ...]:
+    """Return the cameras with pictures of one instant in one frame, by the numbers in their names.
+
+    What all cameras see at once is their recordings, and as a rule their views of the board.
+
+    Raises
+    ------
+    SessionError
+        If recordings lack pictures, and their numbers do not tell which.
+    """
+
+    def placed(
+        sources: list[FrameSource | None], *, is_recording: bool
+    ) -> list[FrameSource | None]:
+        given = [source for source in sources if source is not None]
+        groups = [[source] for source in given] if have_own_counters else [given]
+        try:
+            found = iter([one for group in groups for one in in_step(group)])
+        except SessionError as error:
+            if not is_recording:  # a camera that moves may have views of its own
+                return sources
+            raise SessionError(f"{path}: {error}") from error
+        return [None if source is None else next(found) for source in sources]
+
+    recordings = placed([camera.recording for camera in cameras], is_recording=True)
+    views = placed([camera.extrinsics for camera in cameras], is_recording=False)
+    return tuple(
+        replace(camera, recording=recording, extrinsics=view)
+        for camera, recording, view in zip(cameras, recordings, views, strict=True)
+    )
+
+
+def _rate_of(parsed: SessionTable, cameras: tuple[SessionCamera, ...], path: Path) -> float:
+    """Return the frames a second of the recordings: as the session says, or their files.
+
+    Raises
+    ------
+    SessionError
+        If the files say that cameras differ: frames of one number are not of one instant then.
+    """
+    rates = {
+        camera.name: rate
+        for camera in cameras
+        if camera.recording is not None and (rate := camera.recording.rate()) is not None
+    }
+    if rates:
+        slowest, quickest = (pick(rates, key=lambda name: rates[name]) for pick in (min, max))
+        if rates[quickest] > _SAME_RATE * rates[slowest]:
+            raise SessionError(
+                f"{path}: camera {slowest!r} recorded {rates[slowest]:g} frames a second, camera "
+                f"{quickest!r} {rates[quickest]:g}, so that frames of one number are not of one "
+                "instant; bring them to one rate first (ffmpeg -i IN -r RATE OUT)"
+            )
+    found = statistics.median(rates.values()) if rates else None
+    if parsed.fps is None:
+        if found is None and any(camera.recording is not None for camera in cameras):
+            _log.warning(
+                "%s: fps: this key is missing, and pictures do not say; times are told as if there "
+                "were %g frames a second",
+                path,
+                _NO_RATE,
+            )
+        return found or _NO_RATE
+    if found is not None and not parsed.fps / _SAME_RATE <= found <= _SAME_RATE * parsed.fps:
+        _log.warning(
+            "%s: fps: the session says %g, the videos %g; taken as the session says",
+            path,
+            parsed.fps,
+            found,
+        )
+    return parsed.fps
+
+
 def _as_stored(source: FrameSource | None) -> FrameSource | None:
     """Return masks as what their files hold; what that means is found from them."""
     return None if source is None else replace(source, is_raw=True)
@@ -375,7 +468,6 @@ def _find_files(
     number: int,
     shared_params: dict[str, tuple[float, ...]],
     root: Path,
-    fps: float,
     path: Path,
 ) -> SessionCamera:
     def find(key: str) -> FrameSource | None:
@@ -412,7 +504,7 @@ def _find_files(
         background=background,
         recording=video if table.masks is None else _as_stored(find("masks")),
         has_masks=table.masks is not None,
-        shift_frames=round(table.offset_s * fps),
+        shift_frames=0,  # until the rate is known
         lens=table.lens,
         params=table.params if table.lens is None else shared_params.get(table.lens),
         poses=find_file("poses"),
