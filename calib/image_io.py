@@ -9,7 +9,9 @@ brought to 8 by the bits that hold something: sensors of 10, 12 and 14 bits leav
 empty.
 """
 
+import difflib
 import itertools
+import logging
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,6 +26,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.avi_index import AviFrames, avi_frames
 from hybridve.calib.errors import SessionError
+
+_log = logging.getLogger(__name__)
 
 Image = NDArray[Any]  # uint8, or as it is stored
 
@@ -329,7 +333,11 @@ def _is_even(numbers: Sequence[int]) -> bool:
 
 
 def open_source(root: Path, name: str) -> FrameSource:
-    """Return the source that `name` stands for, relative to the folder `root`.
+    r"""Return the source that `name` stands for, relative to the folder `root`.
+
+    A file of that very name comes before a pattern; a pattern that no file matches is tried with
+    capitals, too; and where ``\`` is in no file's name it is ``/``. What macOS leaves beside files
+    on foreign disks (``._1.png``) is no picture.
 
     Raises
     ------
@@ -337,26 +345,60 @@ def open_source(root: Path, name: str) -> FrameSource:
         If there is no such file, or no file matches the glob. The text says nothing of where the
         name was written; the caller knows.
     """
-    if any(mark in name for mark in "*?["):
-        pattern = Path(name)
-        base, relative = (
-            (Path(pattern.anchor), pattern.relative_to(pattern.anchor))
-            if (pattern.is_absolute())
-            else (root, pattern)
-        )
-        found = [path for path in base.glob(str(relative)) if path.is_file()]
-        if not found:
-            raise SessionError(f"no file matches {name!r} in {root}")
-        return FrameSource(
-            name, tuple(sorted(found, key=lambda path: natural_order(str(path)))), False
-        )
     path = root / name
+    if not path.is_file() and "\\" in name:
+        return replace(open_source(root, name.replace("\\", "/")), label=name)
+    if not path.is_file() and any(mark in name for mark in "*?["):
+        found = _matching(root, name)
+        return FrameSource(
+            name, tuple(sorted(found, key=lambda path: natural_order(str(path)))), is_video=False
+        )
     if not path.is_file():
-        raise SessionError(f"there is no file {name!r} in {root}")
+        raise SessionError(f"there is no file {name!r} in {root}{_nearly(path)}")
     is_video = path.suffix.lower() not in _IMAGE_SUFFIXES
     if is_video:
         _open_video(path, name).release()
     return FrameSource(name, (path,), is_video)
+
+
+def _matching(root: Path, name: str) -> list[Path]:
+    """Return the files that match a pattern.
+
+    Raises
+    ------
+    SessionError
+        If there is none.
+    """
+    pattern = Path(name)
+    base, relative = root, pattern
+    if pattern.is_absolute():
+        base, relative = Path(pattern.anchor), pattern.relative_to(pattern.anchor)
+    # ``[Jj][Pp][Gg]`` in place of ``jpg``: `glob` cannot be told to take capitals for equal.
+    either = re.sub(
+        r"\[[^]]*\]|[^\W\d_]",
+        lambda one: one[0] if len(one[0]) > 1 else f"[{one[0].lower()}{one[0].upper()}]",
+        relative.name,
+    )
+    found: list[Path] = []
+    for last in (relative.name, either):
+        for path in base.glob(str(relative.with_name(last))):
+            if path.is_file() and not path.name.startswith("._"):
+                found.append(path)
+        if found:
+            if last == either:
+                _log.info("%s: no file matches but for capitals; %d do", name, len(found))
+            return found
+    raise SessionError(f"no file matches {name!r} in {root}")
+
+
+def _nearly(path: Path) -> str:
+    """Return, for a message, what is there that has nearly the name of a file that is not."""
+    try:
+        names = [one.name for one in path.parent.iterdir() if one.is_file()]
+    except OSError:
+        return f"; there is no folder {path.parent}"
+    close = difflib.get_close_matches(path.name, names, n=1, cutoff=0.75)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def read_image(path: Path, bits: int = 16) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
 """TOML files that users write: read, checked, and what is wrong told in one line."""
 
+import codecs
 import os
 import re
 import tomllib
@@ -28,9 +29,24 @@ def read_toml(
     except OSError as error:
         raise error_class(f"{path}: cannot be read: {error.strerror}") from error
     try:
-        return tomllib.loads(text.decode()), text
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise error_class(f"{path}: not valid TOML: {error}") from error
+        return tomllib.loads(_decoded(text)), text
+    except UnicodeDecodeError as error:
+        raise error_class(
+            f"{path}: is not UTF-8 at byte {error.start}; save it as UTF-8"
+        ) from error
+    except tomllib.TOMLDecodeError as error:
+        hint = ""
+        if re.search(r"escape|'\\\\'", str(error)):
+            hint = "; write folders with /, or the path in 'single quotes'"
+        raise error_class(f"{path}: not valid TOML: {error}{hint}") from error
+
+
+def _decoded(text: bytes) -> str:
+    """Return a file's text: UTF-8, or what else its first bytes say, as Windows writes it."""
+    for mark, encoding in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
+        if text.startswith(mark):
+            return text.decode(encoding)
+    return text.decode("utf-8-sig")
 
 
 def explain_validation(

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
+import numpy as np
+
 from hybridve.calib.boards.board import Board, Observations
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import N_PARAMS
@@ -60,7 +62,7 @@ def observe_boards(
     ------
     CalibrationError
         Naming the camera, and what was tried, where its clip shows no board at all; if two boards
-        look alike, a camera is listed twice or has no clip, or its stills are of another size
+        look alike, a camera is listed twice or has no clip, or its stills are of another aspect
         than its clip; for corners of a file that belong to no picture.
     """
     _check_boards(boards)
@@ -149,15 +151,42 @@ def _check_inputs(cameras: Sequence[CameraInput]) -> None:
             )
 
 
+def _scaled(camera: CameraInput, stills: Observations, size_px: tuple[int, int]) -> Observations:
+    """Return what was seen in stills as the clip would show it, if both have one aspect.
+
+    Raises
+    ------
+    CalibrationError
+        If they have not.
+    """
+    (width, height), (still_width, still_height) = size_px, stills.size_px
+    # The shorter side of the smaller picture, rounded to a pixel, tells the aspect no closer.
+    if abs(width * still_height - height * still_width) > max(still_width, width):
+        raise CalibrationError(
+            "camera {!r}: intrinsics are {}x{} pixels, extrinsics {}x{}, which is not the same "
+            "picture at another size; record both in the same mode".format(
+                camera.name, *stills.size_px, *size_px
+            )
+        )
+    scale = np.array([width / still_width, height / still_height])
+    word = (
+        f"stills of {still_width}x{still_height} pixels are taken for the same picture as the "
+        f"clip's {width}x{height}, at another size; that is wrong where the clip was cut out of it"
+    )
+    logger.warning("camera %s: %s", camera.name, word)
+    return replace(
+        stills,
+        size_px=size_px,
+        sightings=tuple(replace(one, pixels=one.pixels * scale) for one in stills.sightings),
+    )
+
+
 def _put_together(
     camera: CameraInput, stills: Observations | None, clip: Observations
 ) -> Observations:
     """Return what was seen in stills, where there are any, and in the clip."""
     if stills is not None and stills.size_px != clip.size_px:
-        raise CalibrationError(
-            "camera {!r}: intrinsics are {}x{} pixels, extrinsics {}x{}; record both in the same "
-            "mode".format(camera.name, *stills.size_px, *clip.size_px)
-        )
+        stills = _scaled(camera, stills, clip.size_px)
     seen = clip
     if stills is not None:
         seen = replace(

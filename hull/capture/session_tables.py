@@ -1,9 +1,11 @@
 """The tables of a session.toml, each key with what it may be."""
 
+import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -20,7 +22,18 @@ RigUnit = Literal["m", "cm", "mm", "in", "ft", "squares"]
 #: How many degrees of freedom a lens has is found out from the pictures.
 AUTO_MODEL = "auto"
 
-_NAME = r"^[^/\s\"']+$"
+
+def _is_name(name: str) -> str:
+    """Refuse what cannot be the name of a thing: it becomes that of a folder and of a group."""
+    if not re.fullmatch(r"[^/\\\"'\s]([^/\\\"'\x00-\x1f]*[^/\\\"'\s])?", name) or name[0] == ".":
+        raise ValueError(
+            f"found {name!r}; expected a name without / \\ and quotes, that begins with no dot and "
+            "neither begins nor ends with a space"
+        )
+    return name
+
+
+_Name = Annotated[str, AfterValidator(_is_name)]
 
 _Millimetres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -44,8 +57,8 @@ class TargetTable(_Table):
     """
 
     kind: str
-    name: Annotated[str, Field(pattern=_NAME)]
-    body: Annotated[str, Field(pattern=_NAME)] | None = None
+    name: _Name
+    body: _Name | None = None
     columns: Annotated[int, Field(ge=1)]
     rows: Annotated[int, Field(ge=1)]
 
@@ -187,7 +200,7 @@ class WorldPoint(_Table):
 class CameraTable(_Table):
     """A [[camera]] of a session."""
 
-    name: Annotated[str, Field(pattern=_NAME)]
+    name: _Name
     model: str = "OPENCV"
     intrinsics: str | None = None
     extrinsics: str | None = None

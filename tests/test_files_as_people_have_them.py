@@ -1,0 +1,105 @@
+"""Files as people have them: names, capitals, brackets, what other systems leave behind."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.sessions import write_ball_session
+
+from hybridve.calib.errors import SessionError
+from hybridve.calib.image_io import open_source
+from hybridve.hull.capture.session import load_session
+from hybridve.hull.toml_io import read_toml
+
+
+def write_pictures(folder: Path, *names: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, name in enumerate(names):
+        good, packed = cv2.imencode(".png", np.full((8, 8), number, np.uint8))
+        assert good
+        (folder / name).write_bytes(packed.tobytes())
+
+
+def names_of(root: Path, name: str) -> list[str]:
+    return [path.name for path in open_source(root, name).paths]
+
+
+def test_a_file_of_that_very_name_comes_before_a_pattern(tmp_path: Path) -> None:
+    write_pictures(tmp_path, "take [1].png", "take 1.png", "what?.png")
+
+    assert names_of(tmp_path, "take [1].png") == ["take [1].png"]
+    assert names_of(tmp_path, "what?.png") == ["what?.png"]
+    assert names_of(tmp_path, "take ?.png") == ["take 1.png"]
+
+
+def test_capitals_are_found_where_nothing_else_is(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "loud", "IMG_2.PNG", "IMG_10.PNG")
+    write_pictures(tmp_path / "both", "1.png", "2.PNG")
+
+    assert names_of(tmp_path, "loud/img_*.png") == ["IMG_2.PNG", "IMG_10.PNG"]
+    assert names_of(tmp_path, "loud/IMG_[0-9].png") == ["IMG_2.PNG"]
+    assert names_of(tmp_path, "both/*.png") == ["1.png"]
+    with pytest.raises(SessionError, match="no file matches 'loud/none_"):
+        open_source(tmp_path, "loud/none_*.png")
+
+
+def test_what_macos_leaves_is_no_picture(tmp_path: Path) -> None:
+    write_pictures(tmp_path, "1.png", "2.png")
+    (tmp_path / "._1.png").write_bytes(b"\0\5\x16\7")
+
+    assert names_of(tmp_path, "*.png") == ["1.png", "2.png"]
+
+
+def test_paths_of_windows_are_understood(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "cam1" / "board", "1.png", "2.png")
+
+    assert names_of(tmp_path, "cam1\\board\\1.png") == ["1.png"]
+    assert names_of(tmp_path, "cam1\\board\\*.png") == ["1.png", "2.png"]
+
+
+def test_a_name_that_is_nearly_right_is_told(tmp_path: Path) -> None:
+    write_pictures(tmp_path, "background.png")
+
+    with pytest.raises(SessionError, match=r"no file 'backgruond.png'.*did you mean 'background"):
+        open_source(tmp_path, "backgruond.png")
+    with pytest.raises(SessionError, match="there is no folder"):
+        open_source(tmp_path, "nowhere/background.png")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_toml_is_read_as_windows_writes_it(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "session.toml"
+    path.write_bytes('name = "Gerät"\r\nrows = 3\r\n'.encode(encoding))
+
+    assert read_toml(path, "session", SessionError)[0] == {"name": "Gerät", "rows": 3}
+
+
+def test_toml_that_cannot_be_read_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "session.toml"
+    path.write_bytes('name = "Gerät"'.encode("latin-1"))
+    with pytest.raises(SessionError, match="not UTF-8 at byte 11; save it as UTF-8"):
+        read_toml(path, "session", SessionError)
+    path.write_text('video = "cam1\\video.avi"\n', encoding="utf-8")
+    with pytest.raises(SessionError, match="write folders with /"):
+        read_toml(path, "session", SessionError)
+
+
+@pytest.mark.parametrize("name", ["Camera 1", "Kamera ü", "left (wide)", "cam[2]"])
+def test_a_camera_may_be_called_as_people_call_it(tmp_path: Path, name: str) -> None:
+    path = write_ball_session(tmp_path, np.zeros((2, 3)), n_cameras=3)
+    text = path.read_text(encoding="utf-8").replace('name = "cam1"', f'name = "{name}"')
+    path.write_text(text, encoding="utf-8")
+
+    assert load_session(path).cameras[1].name == name
+
+
+@pytest.mark.parametrize("name", ["a/b", "", " a", "a ", ".a", "a\\\\b", "a'b"])
+def test_a_name_that_cannot_be_a_folder_is_refused_in_words(tmp_path: Path, name: str) -> None:
+    path = write_ball_session(tmp_path, np.zeros((2, 3)), n_cameras=3)
+    text = path.read_text(encoding="utf-8").replace('name = "cam1"', f'name = "{name}"')
+    path.write_text(text, encoding="utf-8")
+
+    with pytest.raises(SessionError, match=r"camera.2.name: found .*expected a name without") as e:
+        load_session(path)
+    assert "pattern" not in str(e.value)
