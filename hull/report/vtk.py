@@ -119,25 +119,37 @@ def _declare(group: h5py.Group, kind: str) -> None:
 
 
 def _add_surface(block: h5py.Group, mesh: StoredMesh, n_frames: int) -> None:
-    """Add a mesh that every frame shows where it stood; of one that moves, a row of points each."""
+    """Add a mesh that every frame shows where it stood; of one that moves, a row of points each.
+
+    Frames in which it is not known where it stood show a second part, which has nothing.
+    """
     moves = len(mesh.placement) > 1
+    is_there = np.isfinite(mesh.placement).all(axis=(1, 2)) & np.ones(n_frames, np.bool_)
     n_vertices, n_triangles = len(mesh.vertices_m), len(mesh.faces)
     points = _growing(block, "Points", (3,), np.float32)
-    for row in range(n_frames if moves else 1):
+    rows = np.flatnonzero(is_there).tolist()
+    for row in rows if moves else rows[:1]:
         _append(points, mesh.vertices_at(row).astype(np.float32))
     every = np.ones(n_frames, np.int64)
+    if not is_there.all():
+        every = (np.arange(max(n_frames, 2)) == 0).astype(np.int64)
     _store(block, "NumberOfPoints", n_vertices * every)
+    cells_before = np.zeros((n_frames, len(_CELLS)), np.int64)
     for number, kind in enumerate(_CELLS):
         n_cells = n_triangles if number == _POLYGONS else 0
         _store(block, f"{kind}/NumberOfCells", n_cells * every)
         _store(block, f"{kind}/NumberOfConnectivityIds", 3 * n_cells * every)
-        _store(block, f"{kind}/Offsets", 3 * np.arange(n_cells + 1, dtype=np.int64))
+        offsets = 3 * np.arange(n_cells + 1, dtype=np.int64)
+        if not is_there.all():
+            offsets = np.append(offsets, 0)
+            cells_before[~is_there, number] = n_cells
+        _store(block, f"{kind}/Offsets", offsets)
         faces = mesh.faces.ravel() if n_cells else mesh.faces.ravel()[:0]
         _append(_growing(block, f"{kind}/Connectivity", (), np.int64), faces.astype(np.int64))
     steps = _add_steps(block, n_frames)
-    _store(steps, "PartOffsets", 0 * every)
-    _store(steps, "PointOffsets", n_vertices * np.arange(n_frames) * int(moves))
-    _store(steps, "CellOffsets", np.zeros((n_frames, len(_CELLS)), np.int64))
+    _store(steps, "PartOffsets", (~is_there).astype(np.int64))
+    _store(steps, "PointOffsets", n_vertices * _before(is_there.astype(np.int64)) * int(moves))
+    _store(steps, "CellOffsets", cells_before)
     _store(steps, "ConnectivityIdOffsets", np.zeros((n_frames, len(_CELLS)), np.int64))
 
 
