@@ -42,7 +42,7 @@ from hybridve.hull.contact.outline_errors import DoubtSettings
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.contact.spacing import Move, covers
 from hybridve.hull.evaluate import evaluate
-from hybridve.hull.query.certify import COLLIDING, Certifier
+from hybridve.hull.query.certify import COLLIDING, Certifier, certify_triangles
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points
@@ -52,6 +52,10 @@ from hybridve.hull.report.read import read_points, read_report
 from hybridve.hull.report.schema import FrameResult
 from hybridve.hull.show import draw_cameras, draw_scene, take_shot
 from hybridve.hull.spacing import Layout, replay, shifts_of
+from hybridve.hull.sweep.experiment import run_sweep
+from hybridve.hull.sweep.frames import read_hulls
+from hybridve.hull.sweep.judgement import make_rows
+from hybridve.hull.sweep.room import EngineRoom
 
 #: The ball goes slowly; the cube comes to it, turning, is in it, and leaves.
 CENTERS = np.array([[0.01 * frame, 0.0, 0.0] for frame in range(7)])
@@ -776,6 +780,32 @@ def test_an_object_that_is_not_moved_violates_where_it_goes(
     near = [result for result in results if any(one.verdict == "clash" for one in result.findings)]
     assert found.standing == {"cube": (len(near), 0)}
     assert len(near) == 3
+
+
+def test_a_sweep_asks_for_it_where_it_was(chain: Chain, results: list[FrameResult]) -> None:
+    rows = make_rows(chain.scene.objects, [5, 9], 0.02)
+    with EngineRoom(Native) as room:
+        outcome = run_sweep(
+            read_hulls(chain),
+            rows,
+            [room],
+            certify=certify_triangles,
+            open_at_m=1e-3,
+            truth_room=room,
+            repeats=1,
+        )
+
+    found = [result.findings[0] for result in results if result.findings]
+    assert outcome.frames.index.tolist() == list(POSES)
+    touched = [int(one.touches) for one in found]
+    assert outcome.frames.objects_colliding.tolist() == touched
+    (native,) = outcome.engines
+    of_nine = int(np.flatnonzero(outcome.rows.viewport == 9)[0])
+    assert native.points[of_nine] == np.mean([one.contact.n_points for one in found])
+    # The truth was sampled at the same place: a sample that collides is near.
+    assert (native.distance_p99_m <= outcome.rows.predicted_near_m).all()
+    assert (native.within_predicted > 0.99).all()
+    assert (native.triangles_against_proof == 0).all()
 
 
 # --- what is refused ------------------------------------------------------------------------------
