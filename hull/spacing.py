@@ -94,7 +94,7 @@ class Layout:
         def there(name: str, one: MovedObject) -> MovedObject:
             if name not in self.motions:
                 return one
-            return replace(one, meter=one.meter.at(self.motions[name].world_from_rest(index)))
+            return replace(one, meter=one.meter.at(self.motions[name].poses[index]))
 
         return replace(
             self,

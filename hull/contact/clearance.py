@@ -250,26 +250,28 @@ class ClearanceMeter:
         self._rounding_m = self._surface.error_m(_FARTHEST * self._roots_m[-1])
         # Distances are to the triangles; the surface that decides about inside may be `apart_m`
         # from them.
-        self.error_m = (
+        self.error_m = self._error_at_rest_m = (
             self._surface.apart_m
             + self._rounding_m
             + _ROUNDOFF * (self._roots_m[-1] + float(np.abs(self._origin).max()))
         )
 
-    def at(self, world_from_rest: Pose | None) -> Self:
+    def at(self, world_from_rest: Pose) -> Self:
         """Return the meter of the object moved rigidly; what is known of distances is shared.
 
         Parameters
         ----------
-        world_from_rest : (3, 4) float64 or None
-            Where it stands, seen from the vertices that this meter was given, metres; None for
-            where they are, for which nothing is converted.
+        world_from_rest : (3, 4) float64
+            Where it stands, seen from the vertices that the meter of the object at rest was given,
+            metres.
         """
         moved = copy.copy(self)
         moved.world_from_rest = world_from_rest
-        if world_from_rest is not None:
-            # On the way to the world and back, and in the projections of cameras seen from here.
-            moved.error_m += _ROUNDOFF * float(np.abs(world_from_rest[:, 3]).max())
+        # Turned and shifted, points and projections lose some tens of u of a root's edge, for
+        # which `_ROUNDOFF` has room, and as much of the way to where the object stands.
+        moved.error_m = self._error_at_rest_m + _ROUNDOFF * float(
+            np.abs(world_from_rest[:, 3]).max()
+        )
         return moved
 
     def _local(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
