@@ -351,7 +351,7 @@ def _body_between(
 ) -> Callable[[float], Body] | None:
     """Return where an object is at a fraction of the way between two frames; None if it rests."""
     motion = chain.scene.objects[number].motion
-    if motion is None or (motion.poses[before.index] == motion.poses[seen.index]).all():
+    if motion is None or np.array_equal(motion.poses[before.index], motion.poses[seen.index]):
         return None
     return lambda fraction: body_at(
         chain, number, motion.between(before.index, seen.index, fraction)

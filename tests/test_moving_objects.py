@@ -400,6 +400,17 @@ def test_a_meter_moved_measures_what_one_made_there_does(seed: int) -> None:
     for one, other in zip(moved.closest(points_world), there.closest(points_world), strict=True):
         if one.dtype == np.float64:
             np.testing.assert_allclose(one, other, atol=1e-12)
+    # Cubes hold what of the hull is near, whichever way they lie, and the boxes about them do.
+    within_m = moved.measure(hull).upper_m + 0.1
+    cells = moved.near_cells(hull, within_m, 0.02, 1 << 14)
+    inside = rng.uniform(-0.3, 0.3, (4000, 3))
+    inside = inside[contains_points(hull, inside)]
+    inside = inside[moved.signed_distance(inside) < within_m]
+    assert len(inside) > 20
+    held = {tuple(place) for place in cells.places(cells.center_world).tolist()}
+    assert {tuple(place) for place in cells.places(inside).tolist()} <= held
+    away = np.abs(inside[:, None] - cells.center_world) - cells.reach_world
+    assert (away.max(axis=2) <= 1e-12).any(axis=1).all()
     # The one at rest stays as it was.
     assert meter.measure(hull).upper_m == far_before.upper_m
     assert meter.world_from_rest is None

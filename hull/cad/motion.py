@@ -114,8 +114,10 @@ class Motion:
             The instant: 0 gives the pose of `before`, 1 that of `after`.
         """
         first, second = self.poses[before], self.poses[after]
-        if fraction in (0.0, 1.0):
-            return second if fraction else first
+        if fraction == 1.0:
+            return second
+        if fraction == 0.0 or np.array_equal(first, second):
+            return first
         turn = rotation_vector(second[:, :3] @ first[:, :3].T)
         rotation = rotation_of(fraction * turn) @ first[:, :3]
         ends = [transform(pose, self.pivot_rest[None])[0] for pose in (first, second)]

@@ -1,10 +1,10 @@
 """``/VTKHDF``: the same report as ParaView and VTK read it.
 
 A report is a VTKHDF file too: a collection with, for each object, its CAD where it stood, and its
-collision points frame after frame. The CAD stands there once for all frames. No numbers stand on
-the points: of a collection with some, VTK 9.7 shows the first frame only; ``/hybridve`` has them.
-Times are a link into ``/hybridve``. Unless all are asked for, the points are a sample: every k-th
-of an object in a frame, at most `MOST_SHOWN`, as attributes say.
+collision points frame after frame. The CAD stands there once for each place that it was at. No
+numbers stand on the points: of a collection with some, VTK 9.7 shows the first frame only;
+``/hybridve`` has them. Times are a link into ``/hybridve``. Unless all are asked for, the points
+are a sample: every k-th of an object in a frame, at most `MOST_SHOWN`, as attributes say.
 
 References
 ----------
@@ -119,17 +119,19 @@ def _declare(group: h5py.Group, kind: str) -> None:
 
 
 def _add_surface(block: h5py.Group, mesh: StoredMesh, n_frames: int) -> None:
-    """Add a mesh that every frame shows where it stood; of one that moves, a row of points each.
+    """Add a mesh that every frame shows where it stood; each place has its points once.
 
     Frames in which it is not known where it stood show a second part, which has nothing.
     """
-    moves = len(mesh.placement) > 1
-    is_there = np.isfinite(mesh.placement).all(axis=(1, 2)) & np.ones(n_frames, np.bool_)
+    placement = np.broadcast_to(mesh.placement, (n_frames, 3, 4)).reshape(n_frames, 12)
+    is_there = np.isfinite(placement).all(axis=1)
+    _, first, place = np.unique(placement[is_there], axis=0, return_index=True, return_inverse=True)
     n_vertices, n_triangles = len(mesh.vertices_m), len(mesh.faces)
     points = _growing(block, "Points", (3,), np.float32)
-    rows = np.flatnonzero(is_there).tolist()
-    for row in rows if moves else rows[:1]:
+    for row in np.flatnonzero(is_there)[first].tolist():
         _append(points, mesh.vertices_at(row).astype(np.float32))
+    points_before = np.zeros(n_frames, np.int64)
+    points_before[is_there] = n_vertices * place.ravel()
     every = np.ones(n_frames, np.int64)
     if not is_there.all():
         every = (np.arange(max(n_frames, 2)) == 0).astype(np.int64)
@@ -147,8 +149,8 @@ def _add_surface(block: h5py.Group, mesh: StoredMesh, n_frames: int) -> None:
         faces = mesh.faces.ravel() if n_cells else mesh.faces.ravel()[:0]
         _append(_growing(block, f"{kind}/Connectivity", (), np.int64), faces.astype(np.int64))
     steps = _add_steps(block, n_frames)
-    _store(steps, "PartOffsets", (~is_there).astype(np.int64))
-    _store(steps, "PointOffsets", n_vertices * _before(is_there.astype(np.int64)) * int(moves))
+    _store(steps, "PartOffsets", np.asarray(~is_there, np.int64))
+    _store(steps, "PointOffsets", points_before)
     _store(steps, "CellOffsets", cells_before)
     _store(steps, "ConnectivityIdOffsets", np.zeros((n_frames, len(_CELLS)), np.int64))
 
