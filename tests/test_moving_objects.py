@@ -786,19 +786,21 @@ MOVE = Move(np.array([1.0, 0.0, 0.0]), -0.1, 0.5, 2e-3)
 def test_spacing_blocks_what_replays_of_objects_at_rest_block(
     session: Path, scene: Path, tmp_path: Path
 ) -> None:
-    settings = {"doubt": None, "clearance_m": None, "response": None}
+    settings = {"clearance_m": None, "response": None}
     chain = chain_of(session, scene, **settings)
     shifts_m = shifts_of(MOVE)
 
     found = replay("moving", chain, Layout.of(chain.scene, ["cube"], MOVE, 0.02), shifts_m)
 
-    shifts_needed = []
+    shifts_needed, at_95 = [], []
     for frame in POSES:
         still = chain_of(
             session, at_rest(tmp_path, frame), frames=FrameRange(frame, frame + 1), **settings
         )
         alone = replay("rests", still, Layout.of(still.scene, ["cube"], MOVE, 0.02), shifts_m)
         shifts_needed.append(alone.shift_m)
+        assert alone.doubt is not None
+        at_95.append(alone.doubt.shift_m)
         # What either blocks for certain, the other does not let be.
         for one, other in ((found, alone), (alone, found)):
             row, of_other = (frame, 0) if one is found else (0, frame)
@@ -808,6 +810,9 @@ def test_spacing_blocks_what_replays_of_objects_at_rest_block(
             assert (maybe | ~certain).all()
     assert found.shift_m == pytest.approx(max(shifts_needed), abs=MOVE.tolerance_m)
     assert found.shift_m > 0.1
+    assert found.doubt is not None
+    assert found.doubt.shift_m == pytest.approx(max(at_95), abs=MOVE.tolerance_m)
+    assert found.doubt.shift_m > found.shift_m
     assert found.frames.reason[LOST] == f"no pose of object 'cube' in frame {LOST}"
     assert found.binding is not None
     frame = int(np.argmax(shifts_needed))
