@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridve.calib.formats.rig_json import rig_to_dict
+from hybridve.calib.pose import Pose, compose
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.schema import Part
 
@@ -88,11 +89,10 @@ def local_origin_m(chain: Chain) -> tuple[float, float, float]:
 
 
 def stored_meshes(chain: Chain) -> tuple[StoredMesh, ...]:
-    """Return the objects' meshes as the report holds them."""
+    """Return the objects' meshes as the report holds them; those that move at rest."""
     meshes = []
     for part, body in zip(chain.scene.objects, chain.bodies, strict=True):
-        placement = part.world_from_mesh.copy()
-        placement[:, 3] -= local_origin_m(chain)
+        placement = _about_origin(chain, part.world_from_mesh)
         viewport = np.zeros(len(body.numbers), np.uint16)
         viewport[body.numbers] = body.triangles.viewports
         meshes.append(
@@ -105,6 +105,26 @@ def stored_meshes(chain: Chain) -> tuple[StoredMesh, ...]:
             )
         )
     return tuple(meshes)
+
+
+def placements(chain: Chain) -> tuple[dict[int, Pose] | None, ...]:
+    """Return by frame of the session where the report has each object's mesh; None if it rests."""
+    return tuple(
+        None
+        if part.motion is None
+        else {
+            frame: _about_origin(chain, compose(pose, part.world_from_mesh))
+            for frame, pose in part.motion.poses.items()
+        }
+        for part in chain.scene.objects
+    )
+
+
+def _about_origin(chain: Chain, world_from_mesh: Pose) -> Pose:
+    """Return a placement (3, 4) in the world as one about the report's local origin, metres."""
+    placement = world_from_mesh.copy()
+    placement[:, 3] -= local_origin_m(chain)
+    return placement
 
 
 def computed_parts(settings: EvaluateSettings) -> frozenset[Part]:

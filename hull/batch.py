@@ -13,6 +13,7 @@ from hybridve.hull.about import (
     about_rig,
     computed_parts,
     local_origin_m,
+    placements,
     resolved_settings,
     stored_meshes,
 )
@@ -97,6 +98,7 @@ def write_report(chain: Chain, output: Path, settings: DetectSettings, watcher: 
             cameras=chain.views.names,
             local_origin_m=local_origin_m(chain),
             meshes=stored_meshes(chain),
+            placements=placements(chain),
             points=settings.points,
         )
         with ReportWriter(

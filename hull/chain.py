@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SceneError, SessionError
 from hybridve.calib.lens import Undistortion, undistortion
 from hybridve.calib.lens_bound import lens_shift_px
+from hybridve.calib.pose import Pose
 from hybridve.calib.rig import Rig
 from hybridve.hull.agreement.common_view import common_view
-from hybridve.hull.cad.scene import Scene
+from hybridve.hull.cad.scene import Scene, SceneObject
 from hybridve.hull.capture.recording import (
     FrameRange,
     check_lengths,
@@ -38,6 +39,7 @@ from hybridve.hull.capture.tracks import Tracks, read_tracks
 from hybridve.hull.contact.detect import (
     Body,
     make_body,
+    moved_body,
 )
 from hybridve.hull.contact.respond import ResponseSettings
 from hybridve.hull.query.silhouettes import (
@@ -107,7 +109,7 @@ class Chain:
     views : Views
         The cameras' pinhole images; moving cameras where they are first tracked (see `views_at`).
     bodies : list of Body
-        The scene's objects, laid into viewports.
+        The scene's objects, laid into viewports; those that move at rest (see `standing_at`).
     silhouettes : Path or None
         Where stored silhouettes stand that are those of this session; None to segment now.
     tracks : Tracks
@@ -216,6 +218,7 @@ def make_chain(
     views, undistortions = rig_views(session, first_rig(rig, tracks))
     if not tracks and (seen := common_view(views)).kind == "none":
         raise SessionError(f"{session.path}: nothing can be in the hull: {seen.reason}")
+    _refuse_no_common_pose(scene)
     bodies = []
     for scene_object in scene.objects:
         try:
@@ -232,6 +235,20 @@ def make_chain(
     )
 
 
+def _refuse_no_common_pose(scene: Scene) -> None:
+    """Refuse objects that no frame has the poses of all of."""
+    moving = {
+        str(one.about.get("object", one.name)): set(one.motion.poses)
+        for one in scene.objects
+        if one.motion is not None
+    }
+    if moving and not set.intersection(*moving.values()):
+        raise SceneError(
+            f"{scene.path}: no frame has a pose of all of {', '.join(moving)}; their files name "
+            "frames of the session, from 0"
+        )
+
+
 def first_rig(rig: Rig, tracks: Tracks) -> Rig:
     """Return the rig with moving cameras where they are first tracked all together."""
     return rig if tracks.first is None else rig.at(tracks.at(tracks.first))
@@ -245,6 +262,59 @@ def views_at(chain: Chain, index: int) -> Views:
     return moved_views(
         chain.session, chain.rig, chain.tracks, index, chain.views, chain.undistortions
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Standing:
+    """The objects of a scene as they stand in one frame.
+
+    Attributes
+    ----------
+    objects : tuple of SceneObject
+        In the scene's order.
+    bodies : list of Body
+        The same, laid into viewports.
+    world_from_rest : tuple of (3, 4) float64 or None
+        Where each is, seen from where the scene places it; None of one that does not move.
+    """
+
+    objects: tuple[SceneObject, ...]
+    bodies: list[Body]
+    world_from_rest: tuple[Pose | None, ...]
+
+    def let_go(self) -> None:
+        """Drop what engines keep of the triangles of objects that move: no frame has them again."""
+        for body, pose in zip(self.bodies, self.world_from_rest, strict=True):
+            if pose is not None:
+                body.triangles.hold(None)
+
+
+def standing_at(chain: Chain, index: int) -> Standing:
+    """Return the scene's objects as they stand in a frame in which no pose is missing.
+
+    Those that do not move are the same objects in all frames.
+    """
+    poses = tuple(
+        None if one.motion is None else one.motion.world_from_rest(index)
+        for one in chain.scene.objects
+    )
+    if not chain.scene.moves:
+        return Standing(chain.scene.objects, chain.bodies, poses)
+    stand = [
+        (one, body) if pose is None else _moved(one, body, pose)
+        for one, body, pose in zip(chain.scene.objects, chain.bodies, poses, strict=True)
+    ]
+    return Standing(tuple(one for one, _ in stand), [body for _, body in stand], poses)
+
+
+def _moved(one: SceneObject, body: Body, world_from_rest: Pose) -> tuple[SceneObject, Body]:
+    moved = one.at(world_from_rest)
+    return moved, moved_body(body, moved)
+
+
+def body_at(chain: Chain, number: int, world_from_rest: Pose) -> Body:
+    """Return one of the scene's objects, by number, laid into viewports and moved rigidly."""
+    return _moved(chain.scene.objects[number], chain.bodies[number], world_from_rest)[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,13 +376,14 @@ def hulls(
     with closing(found) as frames:
         for frame in frames:
             started, hull = time.perf_counter(), None
-            if frame.masks is not None:
+            reason = frame.reason or chain.scene.missing(frame.index)
+            if frame.masks is not None and not reason:
                 hull = make_hull(views_at(chain, frame.index), frame.masks)
             yield FrameHull(
                 index=frame.index,
                 time_s=frame.index / chain.session.fps,
                 hull=hull,
-                reason=frame.reason,
+                reason=reason,
                 decode_s=frame.decode_s,
                 segment_s=frame.segment_s,
                 hull_s=time.perf_counter() - started,

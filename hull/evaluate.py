@@ -14,13 +14,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
+from hybridve.calib.pose import compose, invert, transform
 from hybridve.hull.agreement.frame import Agreement, Coherence, judge_frame
 from hybridve.hull.agreement.sight import sight_of
-from hybridve.hull.contact.backtrack import approach_speed, first_contact
+from hybridve.hull.cad.scene import SceneObject
+from hybridve.hull.contact.backtrack import FirstContact, approach_speed, first_contact
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.contact.detect import (
+    Body,
     Contact,
     certify_contacts,
     detect_contacts,
@@ -42,7 +46,15 @@ if TYPE_CHECKING:
 
 
 from hybridve.hull.about import computed_parts
-from hybridve.hull.chain import Chain, FrameHull, hulls, make_doubter
+from hybridve.hull.chain import (
+    Chain,
+    FrameHull,
+    Standing,
+    body_at,
+    hulls,
+    make_doubter,
+    standing_at,
+)
 from hybridve.hull.trust import Witness
 
 
@@ -92,6 +104,8 @@ def evaluate(
                 findings: tuple[Finding, ...] = ()
                 if seen is not None and state == "evaluated":
                     findings = _findings(chain, tools, before, seen, watch)
+                if seen is not None:
+                    seen.standing.let_go()
                 watch.stage_s["write"] = write_s()
                 yield FrameResult(
                     index=frame.index,
@@ -136,7 +150,23 @@ class _Tools:
     meters: list[ClearanceMeter]
     doubter: "Doubter | None"
     witness: Witness
-    share_seen: list[float]
+    share_seen: list[float | None]
+
+    def meters_at(self, standing: Standing) -> list[ClearanceMeter]:
+        """Return the meters of objects where they stand."""
+        if not self.meters:
+            return []
+        return [
+            meter if pose is None else meter.at(pose)
+            for meter, pose in zip(self.meters, standing.world_from_rest, strict=True)
+        ]
+
+    def shares_seen_at(self, standing: Standing, views: Views) -> list[float]:
+        """Return the share of each object's surface that enough cameras see."""
+        return [
+            _share_seen(one, views) if known is None else known
+            for one, known in zip(standing.objects, self.share_seen, strict=True)
+        ]
 
     @classmethod
     @contextmanager
@@ -162,7 +192,10 @@ class _Tools:
             None if doubter is None else doubter.errors.sigma_px,
             is_still=is_still,
         )
-        shares = _shares_seen(chain, chain.views) if is_still else []
+        shares = [
+            _share_seen(one, chain.views) if is_still and one.motion is None else None
+            for one in chain.scene.objects
+        ]
         with Certifier(settings.open_at_m) if settings.open_at_m else nullcontext() as certifier:
             yield cls(engine, certifier, meters, doubter, witness, shares)
 
@@ -177,6 +210,8 @@ class _Seen:
     agreement: Agreement
     coherence: Coherence
     cameras: tuple[CameraFrame, ...]
+    standing: Standing
+    meters: list[ClearanceMeter]
     contacts: list[Contact]
     clearances: list[Clearance]
 
@@ -191,14 +226,11 @@ class _Seen:
         return "; ".join(filter(None, [self.agreement.reason, self.coherence.reason]))
 
 
-def _shares_seen(chain: Chain, views: Views) -> list[float]:
-    """Return the share of each object's surface that enough cameras see; 0 if that is proved."""
-    shares = []
-    for part in chain.scene.objects:
-        sight = sight_of(views, part.vertices_world, part.faces)
-        least = 0.0 if sight.is_not_seen else float(np.finfo(np.float64).tiny)
-        shares.append(1.0 if sight.is_seen else max(sight.share, least))
-    return shares
+def _share_seen(part: SceneObject, views: Views) -> float:
+    """Return the share of an object's surface that enough cameras see; 0 if that is proved."""
+    sight = sight_of(views, part.vertices_world, part.faces)
+    least = 0.0 if sight.is_not_seen else float(np.finfo(np.float64).tiny)
+    return 1.0 if sight.is_seen else max(sight.share, least)
 
 
 def _look(chain: Chain, tools: _Tools, frame: FrameHull, hull: Hull, watch: _Stopwatch) -> _Seen:
@@ -221,14 +253,17 @@ def _look(chain: Chain, tools: _Tools, frame: FrameHull, hull: Hull, watch: _Sto
         )
     )
     watch.lap("agree")
+    standing = standing_at(chain, frame.index)
+    meters = tools.meters_at(standing)
+    alone = (frame.index, frame.time_s, hull, agreement, found, cameras, standing, meters)
     if agreement.is_contradictory:
-        return _Seen(frame.index, frame.time_s, hull, agreement, found, cameras, [], [])
-    contacts = detect_contacts(hull, chain.bodies, tools.engine)
+        return _Seen(*alone, [], [])
+    contacts = detect_contacts(hull, standing.bodies, tools.engine)
     watch.lap("query")
     if tools.certifier is not None:
-        contacts = certify_contacts(hull, chain.bodies, contacts, tools.certifier)
+        contacts = certify_contacts(hull, standing.bodies, contacts, tools.certifier)
     watch.lap("certify")
-    clearances = [meter.measure(hull) for meter in tools.meters]
+    clearances = [meter.measure(hull) for meter in meters]
     if clearances:
         pairs = [
             agreed(contact, clearance)
@@ -240,7 +275,7 @@ def _look(chain: Chain, tools: _Tools, frame: FrameHull, hull: Hull, watch: _Sto
             for (_, clearance), part in zip(pairs, chain.scene.objects, strict=True)
         ]
     watch.lap("clearance")
-    return _Seen(frame.index, frame.time_s, hull, agreement, found, cameras, contacts, clearances)
+    return _Seen(*alone, contacts, clearances)
 
 
 def _findings(
@@ -253,12 +288,12 @@ def _findings(
         if before is not None:
             finding = _compared(chain, tools, number, before, seen, finding)
         if finding.touches and chain.settings.response is not None:
-            finding = replace(finding, response=_response(chain, number, seen.hull, finding))
+            finding = replace(finding, response=_response(chain, number, before, seen, finding))
         findings.append(finding)
     watch.lap("respond")
-    shares = tools.share_seen or _shares_seen(chain, seen.hull.views)
+    shares = tools.shares_seen_at(seen.standing, seen.hull.views)
     findings = [
-        _completed(chain, tools, seen, number, finding, share)
+        _completed(chain, seen, number, finding, share)
         for number, (finding, share) in enumerate(zip(findings, shares, strict=True))
     ]
     watch.lap("patches")
@@ -271,9 +306,7 @@ def _findings(
                     meter, finding.contact, finding.clearance, part.required_clearance_m
                 ),
             )
-            for finding, meter, part in zip(
-                findings, tools.meters, chain.scene.objects, strict=True
-            )
+            for finding, meter, part in zip(findings, seen.meters, chain.scene.objects, strict=True)
             if finding.clearance is not None
         ]
     watch.lap("doubt")
@@ -299,10 +332,11 @@ def _compared(
     first = first_contact(
         before.hull,
         seen.hull,
-        chain.bodies[number],
+        seen.standing.bodies[number],
         finding.contact,
         tools.certifier,
         tools.engine,
+        _body_between(chain, number, before, seen),
     )
     return replace(
         finding,
@@ -312,11 +346,23 @@ def _compared(
     )
 
 
+def _body_between(
+    chain: Chain, number: int, before: _Seen, seen: _Seen
+) -> Callable[[float], Body] | None:
+    """Return where an object is at a fraction of the way between two frames; None if it rests."""
+    motion = chain.scene.objects[number].motion
+    if motion is None or np.array_equal(motion.poses[before.index], motion.poses[seen.index]):
+        return None
+    return lambda fraction: body_at(
+        chain, number, motion.between(before.index, seen.index, fraction)
+    )
+
+
 def _completed(
-    chain: Chain, tools: _Tools, seen: _Seen, number: int, finding: Finding, share_seen: float
+    chain: Chain, seen: _Seen, number: int, finding: Finding, share_seen: float
 ) -> Finding:
     """Return a finding with its verdict, its patches, and what moving the whole object does."""
-    part, hull = chain.scene.objects[number], seen.hull
+    part, hull = seen.standing.objects[number], seen.hull
     required_m = part.required_clearance_m
     finding = judged(
         finding,
@@ -328,7 +374,7 @@ def _completed(
     )
     if finding.clearance is None:
         return finding
-    meter = tools.meters[number]
+    meter = seen.meters[number]
     if finding.verdict in ("clash", "inside", "too near"):
         patches = contact_patches(
             hull,
@@ -346,16 +392,30 @@ def _completed(
     return finding
 
 
-def _response(chain: Chain, number: int, hull: Hull, finding: Finding) -> Response:
-    part = chain.scene.objects[number]
+def _response(
+    chain: Chain, number: int, before: _Seen | None, seen: _Seen, finding: Finding
+) -> Response:
+    part = seen.standing.objects[number]
     begins_at = None
-    if chain.settings.backtrack and finding.first_contact is not None:
-        begins_at = finding.first_contact.point_world
+    if chain.settings.backtrack and finding.first_contact is not None and before is not None:
+        begins_at = _carried(chain, number, before, seen, finding.first_contact)
     return respond(
-        hull,
+        seen.hull,
         finding.contact,
         reference_point_world=part.reference_point_world,
         recovery_direction=part.recovery_direction,
         settings=chain.settings.response,
         cp_obj_world=begins_at,
     )
+
+
+def _carried(
+    chain: Chain, number: int, before: _Seen, seen: _Seen, first: FirstContact
+) -> NDArray[np.float64]:
+    """Return the point of the object that was touched first, (3,), where it is in the frame."""
+    motion = chain.scene.objects[number].motion
+    # Where the outline is lost, the point is one of this frame already.
+    if motion is None or first.status == "outline lost":
+        return first.point_world
+    touched, now = (motion.between(before.index, seen.index, at) for at in (first.fraction, 1.0))
+    return np.asarray(transform(compose(now, invert(touched)), first.point_world[None])[0])

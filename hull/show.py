@@ -17,6 +17,7 @@ from hybridve.hull.agreement.pieces import drop_unconfirmed
 from hybridve.hull.agreement.record import NamedCause
 from hybridve.hull.agreement.search import make_pencils
 from hybridve.hull.agreement.told import brief
+from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.capture.recording import (
     FrameRange,
     as_recorded,
@@ -26,7 +27,7 @@ from hybridve.hull.capture.recording import (
     undistort_mask,
 )
 from hybridve.hull.capture.session import Session, SessionCamera
-from hybridve.hull.chain import Chain, make_doubter, views_at
+from hybridve.hull.chain import Chain, make_doubter, standing_at, views_at
 from hybridve.hull.contact.detect import Contact, detect_contacts
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, make_hull
@@ -63,6 +64,8 @@ class Shot:
         The frame's hull.
     contacts : list of Contact
         One for each object of the scene.
+    objects : tuple of SceneObject
+        The scene's objects, as they stand in this frame.
     """
 
     chain: Chain
@@ -71,6 +74,7 @@ class Shot:
     masks: list[NDArray[np.uint8]]
     hull: Hull
     contacts: list[Contact]
+    objects: tuple[SceneObject, ...]
 
 
 def take_shot(chain: Chain, index: int, engine: Engine) -> Shot:
@@ -80,14 +84,18 @@ def take_shot(chain: Chain, index: int, engine: Engine) -> Shot:
     ------
     SessionError
         If the recording does not have this frame, or a camera lacks it, or it is not known where
-        one was.
+        one was, or an object that moves.
     """
+    if missing := chain.scene.missing(index):
+        raise SessionError(f"{chain.session.path}: frame {index}: {missing}")
     recorded = _silhouettes(chain, index)
     views = views_at(chain, index)
     masks = drop_unconfirmed(views, chain.undistortions, recorded)
     hull = make_hull(views, _undistorted(chain, masks))
     rig = chain.rig.at(chain.tracks.at(index))
-    return Shot(chain, rig, index, masks, hull, detect_contacts(hull, chain.bodies, engine))
+    standing = standing_at(chain, index)
+    contacts = detect_contacts(hull, standing.bodies, engine)
+    return Shot(chain, rig, index, masks, hull, contacts, standing.objects)
 
 
 def draw_scene(shot: Shot, size_px: tuple[int, int]) -> Image:
@@ -234,5 +242,5 @@ def _drawn_objects(shot: Shot) -> list[DrawnObject]:
             hit_triangles=contact.triangles(),
             hit_points_world=contact.points()[0],
         )
-        for part, contact in zip(shot.chain.scene.objects, shot.contacts, strict=True)
+        for part, contact in zip(shot.objects, shot.contacts, strict=True)
     ]

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -15,6 +15,7 @@ from hybridve.hull.about import resolved_settings
 from hybridve.hull.agreement.frame import judge_frame
 from hybridve.hull.agreement.outlines import FrameOutlines
 from hybridve.hull.agreement.record import SessionAgreement
+from hybridve.hull.cad.motion import Motion
 from hybridve.hull.cad.scene import Scene, SceneObject, load_scene
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import (
@@ -70,9 +71,12 @@ class Layout:
     move : Move
         Whereto.
     moved, standing : tuple of MovedObject
-        The objects that are moved, and all others of the scene.
+        The objects that are moved, and all others of the scene. Those that move by themselves are
+        so in the frames of a recording (see `at`).
     moved_names, standing_names : tuple of str
         Their names.
+    motions : mapping of str to Motion
+        How those move that do, by name.
     """
 
     move: Move
@@ -80,6 +84,23 @@ class Layout:
     standing: tuple[MovedObject, ...]
     moved_names: tuple[str, ...]
     standing_names: tuple[str, ...]
+    motions: Mapping[str, Motion] = field(default_factory=dict)
+
+    def at(self, index: int) -> "Layout":
+        """Return the layout as it is in a frame in which no object lacks a pose."""
+        if not self.motions:
+            return self
+
+        def there(name: str, one: MovedObject) -> MovedObject:
+            if name not in self.motions:
+                return one
+            return replace(one, meter=one.meter.at(self.motions[name].poses[index]))
+
+        return replace(
+            self,
+            moved=tuple(map(there, self.moved_names, self.moved)),
+            standing=tuple(map(there, self.standing_names, self.standing)),
+        )
 
     @classmethod
     def of(
@@ -135,6 +156,7 @@ class Layout:
             tuple(measured(one, one.required_clearance_m) for one in standing),
             tuple(one.name for one in moved),
             tuple(one.name for one in standing),
+            {one.name: one.motion for one in scene.objects if one.motion is not None},
         )
 
 
@@ -384,7 +406,7 @@ class _Tally:
 
         `doubts` are those of the hull, if it is to be doubted.
         """
-        layout = self._layout
+        layout = self._layout.at(index)
         started = time.perf_counter()
         blocked = blocked_shifts(hull, layout.moved, layout.move)
         mine = union(blocked.violated_m, blocked.undecided_m)
@@ -392,7 +414,7 @@ class _Tally:
         ends = set(mine[:, 1].tolist()).intersection(self._together[:, 1].tolist())
         for shift_m in ends:
             # At the end of the range the worst frame is kept; elsewhere there is but one.
-            found = self._binding(index, time_s, hull, shift_m)
+            found = self._binding(layout, index, time_s, hull, shift_m)
             known = self._at_end.get(shift_m)
             if known is None or _spare_m(found) < _spare_m(known):
                 self._at_end[shift_m] = found
@@ -420,8 +442,9 @@ class _Tally:
         self._unsure.append(unsure)
         self._measure_s.append(measure_s)
 
-    def _binding(self, index: int, time_s: float, hull: Hull, shift_m: float) -> Binding:
-        layout = self._layout
+    def _binding(
+        self, layout: Layout, index: int, time_s: float, hull: Hull, shift_m: float
+    ) -> Binding:
         number, clearance = tightest_at(hull, layout.moved, layout.move, shift_m)
         return Binding(
             frame=index,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.tracker import read_poses
+from hybridve.calib.formats.tracker import read_angles, read_poses
 
 HEAD = "frame,x,y,z,qw,qx,qy,qz\n"
 #: A turn by 90 degrees about z: x becomes y.
@@ -67,6 +67,13 @@ def test_frames_come_in_order_and_lost_ones_not_at_all(tmp_path: Path) -> None:
     text = f"{HEAD}7,1,2,3,{QUARTER}\n2,1,2,3,{QUARTER}\n3,,,,,,,\n4,nan,nan,nan,nan,nan,nan,nan\n"
 
     assert list(read_poses(written(tmp_path, text))) == [2, 7]
+
+
+def test_angles_are_read_in_radians_as_poses_are(tmp_path: Path) -> None:
+    text = "# the door\nnote,Angle_deg,frame\nopen,90,7\n\nshut,-180,2\nlost,,3\nlost,nan,4\n"
+
+    assert read_angles(written(tmp_path, text)) == {2: -np.pi, 7: np.pi / 2}
+    assert list(read_angles(written(tmp_path, "angle_deg\n1\n\n2\n"))) == [0, 1]
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,11 @@ rotation as a quaternion), or ``m11,m12,..,m34`` (the matrix ``[R | t]`` by rows
 ``tracking_from_tracker``: they map coordinates on the body to the tracker's own world. With a
 column ``frame`` rows may be missing; without one they are frames 0, 1, 2, ... Other columns are
 left alone, as are lines that begin with #. Quaternions spelled x, y, z, w are read by their names.
+The angles of a hinge are read from the same kind of file, with a column ``angle_deg``.
 """
 
 import csv
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
@@ -22,6 +24,7 @@ _ROUNDED = 1e-3
 
 _PLACE = ("x", "y", "z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
+_ANGLE = "angle_deg"
 _MATRIX = tuple(f"m{row}{column}" for row, column in product((1, 2, 3), (1, 2, 3, 4)))
 
 
@@ -42,36 +45,15 @@ def read_poses(path: Path) -> dict[int, Pose]:
         If it cannot be read, lacks columns or holds no pose, a number is none, a rotation is none,
         or a frame stands there twice.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: there is no such file of poses") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot be read: {error}") from error
-    numbered = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    rows = [next(csv.reader([line])) for _, line in numbered]
-    header = [name.strip().lower() for name in rows[0]] if rows else []
+    header, rows = _read_table(path, "poses")
     wanted = _PLACE + _QUATERNION if set(_PLACE + _QUATERNION) <= set(header) else _MATRIX
     if not set(wanted) <= set(header):
         raise CalibrationError(
             f"{path}: the first line is {','.join(header)[:80]!r}; expected the columns "
             "frame,x,y,z,qw,qx,qy,qz or frame,m11,m12,..,m34 (frame may be left out)"
         )
-    columns = [header.index(name) for name in wanted]
-    frame_column = header.index("frame") if "frame" in header else None
     poses: dict[int, Pose] = {}
-    for position, ((number, _), row) in enumerate(zip(numbered[1:], rows[1:], strict=True)):
-        where = f"{path}: line {number}"
-        if len(row) != len(header):
-            raise CalibrationError(f"{where}: has {len(row)} columns, the first line {len(header)}")
-        frame = position if frame_column is None else _frame(row[frame_column], where)
-        values = np.array([_number(row[column], where) for column in columns])
-        if np.isnan(values).all():
-            continue
+    for frame, values, where in _by_frame(header, rows, wanted):
         if not np.isfinite(values).all():
             raise CalibrationError(f"{where}: a part of the pose is missing; expected all or none")
         if frame in poses:
@@ -84,6 +66,78 @@ def read_poses(path: Path) -> dict[int, Pose]:
     if not poses:
         raise CalibrationError(f"{path}: holds no pose; expected one row a frame")
     return dict(sorted(poses.items()))
+
+
+def read_angles(path: Path) -> dict[int, float]:
+    """Return the angles of a hinge in radians, by frame, ascending; frames without have no entry.
+
+    The first line names the columns, ``angle_deg`` among them; all else is as with poses.
+
+    Parameters
+    ----------
+    path : Path
+        The CSV file.
+
+    Raises
+    ------
+    CalibrationError
+        If it cannot be read, lacks the column or holds no angle, a number is none, or a frame
+        stands there twice.
+    """
+    header, rows = _read_table(path, "angles")
+    if _ANGLE not in header:
+        raise CalibrationError(
+            f"{path}: the first line is {','.join(header)[:80]!r}; expected the columns "
+            f"frame,{_ANGLE} (frame may be left out)"
+        )
+    angles_rad: dict[int, float] = {}
+    for frame, (angle_deg,), where in _by_frame(header, rows, (_ANGLE,)):
+        if not np.isfinite(angle_deg):
+            raise CalibrationError(f"{where}: {_ANGLE} is {angle_deg}, expected a finite number")
+        if frame in angles_rad:
+            raise CalibrationError(f"{where}: frame {frame} stands there twice")
+        angles_rad[frame] = float(np.deg2rad(angle_deg))
+    if not angles_rad:
+        raise CalibrationError(f"{path}: holds no angle; expected one row a frame")
+    return dict(sorted(angles_rad.items()))
+
+
+#: A row of a table: where it stands, and what it holds, column by column.
+_Row = tuple[str, list[str]]
+
+
+def _read_table(path: Path, what: str) -> tuple[list[str], list[_Row]]:
+    """Return what a file calls its columns, and its rows."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError:
+        raise CalibrationError(f"{path}: there is no such file of {what}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: cannot be read: {error}") from error
+    rows = [
+        (f"{path}: line {number}", next(csv.reader([line])))
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    return [name.strip().lower() for name in rows[0][1]] if rows else [], rows[1:]
+
+
+def _by_frame(
+    header: list[str], rows: list[_Row], wanted: tuple[str, ...]
+) -> Iterator[tuple[int, NDArray[np.float64], str]]:
+    """Yield of each row its frame, the numbers in some columns, and where it stands.
+
+    Rows in which none of them stands are left out.
+    """
+    columns = [header.index(name) for name in wanted]
+    frame_column = header.index("frame") if "frame" in header else None
+    for position, (where, row) in enumerate(rows):
+        if len(row) != len(header):
+            raise CalibrationError(f"{where}: has {len(row)} columns, the first line {len(header)}")
+        frame = position if frame_column is None else _frame(row[frame_column], where)
+        values = np.array([_number(row[column], where) for column in columns])
+        if not np.isnan(values).all():
+            yield frame, values, where
 
 
 def _frame(text: str, where: str) -> int:

@@ -12,22 +12,35 @@ them.
 STEP, glTF and COLLADA bring their unit (glTF is metres by its standard), and most FBX do; for all
 others the scene must give it. For glTF, COLLADA and FBX it may, against what the file says; for
 STEP it may not.
+
+An object that moves is placed by the scene in a frame of its own, and a CSV file tells where that
+was, frame by frame of the session (`hybridve.hull.cad.motion`); by ``poses``, by a ``track``, or by
+a ``hinge``.
 """
 
 import hashlib
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from hybridve.calib.errors import SceneError
-from hybridve.calib.pose import placed, rotation_about_axes
+from hybridve.calib.errors import CalibrationError, SceneError
+from hybridve.calib.formats.tracker import read_angles, read_poses
+from hybridve.calib.pose import Pose, compose, placed, rotation_about_axes
 from hybridve.hull.cad.mesh import TESSELLATION_M, CadFile, kind_of, read_cad
+from hybridve.hull.cad.motion import Motion
 from hybridve.hull.cad.part import Part, Up
 from hybridve.hull.cad.readers import FORMATS, TESSELLATED, WITH_UNIT
 from hybridve.hull.cad.topology import Topology, meeting_faces
@@ -50,6 +63,29 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class _HingeTable(_Table):
+    axis: _Vector
+    anchor_mm: _Vector
+    angles: str
+
+    @field_validator("axis")
+    @classmethod
+    def _has_length(cls, axis: _Vector) -> _Vector:
+        if not any(axis):
+            raise ValueError("[0, 0, 0] is no axis; give its direction")
+        return axis
+
+
+class _TrackTable(_Table):
+    poses: str
+    object_from_tracker_mm: _Vector = (0.0, 0.0, 0.0)
+    rotate_deg: _Vector = (0.0, 0.0, 0.0)
+
+
+#: The keys of what makes an object move.
+_MOTIONS = ("poses", "hinge", "track")
+
+
 class _ObjectTable(_Table):
     # The name becomes a group of the report, where "/" separates and "." stands for the group.
     name: Annotated[str, Field(pattern=r"^[^/\s.][^/\s]*$")]
@@ -64,6 +100,9 @@ class _ObjectTable(_Table):
     required_clearance_mm: Annotated[float, Field(ge=0)] = 0.0
     reference_point_mm: _Vector | None = None
     recovery_direction: _Vector | None = None
+    poses: str | None = None
+    hinge: _HingeTable | None = None
+    track: _TrackTable | None = None
 
     @field_validator("recovery_direction")
     @classmethod
@@ -71,6 +110,13 @@ class _ObjectTable(_Table):
         if direction is not None and not any(direction):
             raise ValueError("[0, 0, 0] points nowhere; give a direction")
         return direction
+
+    @model_validator(mode="after")
+    def _moves_in_one_way(self) -> "_ObjectTable":
+        given = [key for key in _MOTIONS if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"has {' and '.join(given)}; an object moves in one way, keep one")
+        return self
 
 
 class _KeyError(Exception):
@@ -128,6 +174,9 @@ class SceneObject:
         Metres, in the frame of the mesh, turned z up; None if that is the world's.
     world_from_mesh : (3, 4) float64
         Where that frame lies: `vertices_world` is `placed` by it.
+    motion : Motion or None
+        How it moves; None for one that stands where it is. Of one that moves everything above is
+        told at rest, as the scene places it; `at` tells it of a frame.
     """
 
     name: str
@@ -144,6 +193,30 @@ class SceneObject:
     about: dict[str, Any] = field(default_factory=dict)
     vertices_mesh: NDArray[np.float64] | None = None
     world_from_mesh: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))
+    motion: Motion | None = None
+
+    def at(self, world_from_rest: Pose) -> "SceneObject":
+        """Return the object moved rigidly from where it rests: it stands there, without a motion.
+
+        Parameters
+        ----------
+        world_from_rest : (3, 4) float64
+            Metres.
+        """
+        vertices_mesh = self.vertices_world if self.vertices_mesh is None else self.vertices_mesh
+        world_from_mesh = compose(world_from_rest, self.world_from_mesh)
+        vertices_world = placed(vertices_mesh, world_from_mesh)
+        vertices_world.flags.writeable = False
+        rotation, direction = world_from_rest[:, :3], self.recovery_direction
+        return replace(
+            self,
+            vertices_world=vertices_world,
+            reference_point_world=rotation @ self.reference_point_world + world_from_rest[:, 3],
+            recovery_direction=None if direction is None else rotation @ direction,
+            vertices_mesh=vertices_mesh,
+            world_from_mesh=world_from_mesh,
+            motion=None,
+        )
 
     @property
     def box_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -165,7 +238,8 @@ class Scene:
     effects : tuple of dict
         The ``[[effect]]`` tables as they stand.
     checksum : str
-        SHA-256 over the scene.toml, the meshes it names, and the files that these lean on.
+        SHA-256 over the scene.toml, the meshes it names, the files that these lean on, and the
+        files that tell where objects move.
     """
 
     path: Path
@@ -173,12 +247,34 @@ class Scene:
     effects: tuple[dict[str, Any], ...]
     checksum: str
 
+    @property
+    def moves(self) -> bool:
+        """Whether an object moves."""
+        return any(one.motion is not None for one in self.objects)
+
+    def missing(self, index: int) -> str:
+        """Say which objects that move have no pose in a frame; "" if none of them lacks one."""
+        # Parts of one file move together: it is named once.
+        names = dict.fromkeys(
+            str(one.about.get("object", one.name))
+            for one in self.objects
+            if one.motion is not None and one.motion.world_from_rest(index) is None
+        )
+        return "; ".join(f"no pose of object {name!r} in frame {index}" for name in names)
+
 
 def load_scene(path: Path) -> Scene:
     """Return the scene that a scene.toml describes, its meshes in metres in the world.
 
     An object's file is turned z up, scaled by its unit, turned by `rotate_deg` about x, then y,
-    then z of the world, and moved by `translate_mm`.
+    then z of the world, and moved by `translate_mm`. That is where one that moves is at rest:
+
+    * ``poses``: a file of poses (`hybridve.calib.formats.tracker`), world_from_rest by frame of the
+      session;
+    * ``track``: the same of a tracker on the object. ``object_from_tracker_mm`` and ``rotate_deg``
+      (about x, then y, then z) say where it sits: ``x_rest = R x_tracker + t``;
+    * ``hinge``: turned about ``axis`` through ``anchor_mm``, both given in the frame of the mesh
+      after it was turned z up, by the angle that the file ``angles`` has for each frame.
 
     Each object's `about` holds: ``object`` (the name of its table, which parts of one file share),
     ``mesh`` (as the scene names it), ``format``, ``part`` (what the object is called after that
@@ -188,13 +284,14 @@ def load_scene(path: Path) -> Scene:
     ``n_triangles``, ``n_vertices``, ``n_zero_area``, ``n_open_edges``, ``n_nonmanifold_edges``,
     ``n_inconsistent_edges``, ``closed``, ``closed_within_m`` (0, or the noise of single precision),
     ``volume_m3`` and ``inside_out`` (these three None if not closed), and ``material`` (``name``
-    and ``rgba``, either None). How edges are counted, and what closed means, is told in
+    and ``rgba``, either None); of one that moves ``motion``: ``kind``, ``file`` (as the scene names
+    it) and ``n_frames``. How edges are counted, and what closed means, is told in
     `hybridve.hull.cad.topology`; nothing is repaired.
 
     Raises
     ------
     SceneError
-        One line that names the key at fault, or what is wrong with a mesh.
+        One line that names the key at fault, or what is wrong with a mesh or a file of poses.
     """
     table, text = read_toml(path, "scene", SceneError)
     _refuse_missing_units(table, path)
@@ -232,7 +329,8 @@ def load_scene(path: Path) -> Scene:
                 f"{label}.unit: this key is missing; this {cad.kind} file does not say its unit, "
                 f"and it is never guessed: one of {', '.join(UNITS_M)}"
             )
-        for part in _place(entry, cad):
+        motion = _motion(entry, root, label)
+        for part in _place(entry, cad, motion):
             if part.name in objects:
                 raise SceneError(
                     f"{label}.name: this object or a part of it would be called {part.name!r}, "
@@ -241,6 +339,8 @@ def load_scene(path: Path) -> Scene:
             objects[part.name] = part
         for file in (cad.path, *cad.beside):
             checksum.update(file.read_bytes())
+        if (told_by := _motion_file(entry)) is not None:
+            checksum.update((root / told_by[1]).read_bytes())
     return Scene(
         path=path,
         objects=tuple(objects.values()),
@@ -276,14 +376,57 @@ def _refuse_what_the_kind_has(entry: _ObjectTable, kind: str, label: str) -> Non
         )
 
 
-def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
+def _motion_file(entry: _ObjectTable) -> tuple[str, str] | None:
+    """Return the key that names the file of an object's motion, and that name; None if at rest."""
+    if entry.poses is not None:
+        return "poses", entry.poses
+    if entry.hinge is not None:
+        return "hinge.angles", entry.hinge.angles
+    if entry.track is not None:
+        return "track.poses", entry.track.poses
+    return None
+
+
+def _motion(entry: _ObjectTable, root: Path, label: str) -> Motion | None:
+    """Return how an object moves; None if it does not."""
+    told_by = _motion_file(entry)
+    if told_by is None:
+        return None
+    key, name = told_by
+    try:
+        if entry.hinge is not None:
+            rotation, translation_m = _placement(entry)
+            return Motion.of_hinge(
+                read_angles(root / name),
+                rotation @ np.array(entry.hinge.axis),
+                rotation @ (np.array(entry.hinge.anchor_mm) / 1000.0) + translation_m,
+            )
+        poses = read_poses(root / name)
+    except CalibrationError as error:
+        raise SceneError(f"{label}.{key}: {error}") from error
+    if entry.track is None:
+        return Motion.of_poses(poses)
+    object_from_tracker = np.column_stack(
+        [
+            rotation_about_axes(entry.track.rotate_deg),
+            np.array(entry.track.object_from_tracker_mm) / 1000.0,
+        ]
+    )
+    return Motion.of_track(poses, object_from_tracker)
+
+
+def _placement(entry: _ObjectTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how the scene turns a mesh (3, 3), and by how much it moves it (3,), metres."""
+    return rotation_about_axes(entry.rotate_deg), np.array(entry.translate_mm) / 1000.0
+
+
+def _place(entry: _ObjectTable, cad: CadFile, motion: Motion | None) -> Iterator[SceneObject]:
     """Yield the objects that a file becomes."""
     up = entry.up or cad.up
     unit_m = UNITS_M[entry.unit] if entry.unit is not None else cad.unit_m
     if unit_m is None:
         raise ValueError(f"{entry.name}: neither the scene nor the file gives a unit")
-    rotation = rotation_about_axes(entry.rotate_deg)
-    translation_m = np.array(entry.translate_mm) / 1000.0
+    rotation, translation_m = _placement(entry)
     direction = None
     if entry.recovery_direction is not None:
         direction = rotation @ np.array(entry.recovery_direction)
@@ -305,7 +448,7 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
         else:
             used = vertices_world[part.faces.ravel()]
             reference_point_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
-        about = {
+        about: dict[str, Any] = {
             "object": entry.name,
             "mesh": entry.mesh,
             "format": cad.kind,
@@ -316,6 +459,10 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             "tessellation_m": cad.tessellation_m,
             "notes": list(cad.notes),
         }
+        told_by = _motion_file(entry)
+        if motion is not None and told_by is not None:
+            kind = told_by[0].partition(".")[0]
+            about["motion"] = {"kind": kind, "file": told_by[1], "n_frames": len(motion.poses)}
         for array in (vertices_mesh, vertices_world, part.faces):
             array.flags.writeable = False  # so that nobody need copy them
         yield SceneObject(
@@ -333,6 +480,7 @@ def _place(entry: _ObjectTable, cad: CadFile) -> Iterator[SceneObject]:
             about=about | _about_mesh(part, topology, unit_m),
             vertices_mesh=vertices_mesh,
             world_from_mesh=world_from_mesh,
+            motion=motion,
         )
 
 

@@ -24,11 +24,15 @@ A camera that moves is taken to go straight and to turn evenly between its two p
 silhouettes are first turned to where it looks at the instant, which is exact but for what its
 straight way shifts; the rest is motion as above.
 
+An object that moves stands, at each instant, where its own estimate of the way between its two
+poses puts it (`hybridve.hull.cad.motion`).
+
 What no shift explains and no blend keeps, something that was not there a frame before, is told by
 the status "outline lost": then the instant is unknown within the frame.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -80,7 +84,8 @@ class FirstContact:
         Bound: how far the instant can be from it. All that is certain is that it lies between the
         two frames: ``max(fraction, 1 - fraction)``.
     point_world : (3,) float64
-        Metres: estimate of the point of first contact. It lies on the object's surface.
+        Metres: estimate of the point of first contact. It lies on the object's surface, of one
+        that moves as it stood at that instant.
     status : str
         ``""``: as described. ``"outline lost"``: what touches was not there a frame before, or
         moved in a way that cannot be followed; the fraction is 0.5, the point one of the second
@@ -103,6 +108,7 @@ def first_contact(
     contact: Contact,
     certifier: Certifier | None,
     engine: Engine,
+    body_at: Callable[[float], Body] | None = None,
 ) -> FirstContact:
     """Return when and where an object that is free in one frame and collides in the next was hit.
 
@@ -114,7 +120,7 @@ def first_contact(
     before, after : Hull
         The last frame without and the first with a collision, of the same cameras.
     body : Body
-        The object, at rest between the two.
+        The object as it stands in the second frame.
     contact : Contact
         Its contact with `after`.
     certifier : Certifier or None
@@ -122,6 +128,8 @@ def first_contact(
         checked in double precision.
     engine : Engine
         Not used where there is a certifier.
+    body_at : callable, optional
+        Of an object that moves between the two, where it stands at a fraction of the way.
 
     Raises
     ------
@@ -131,16 +139,23 @@ def first_contact(
     interpolated_views(before.views, after.views, 0.5)  # other cameras are refused
     if not contact.collides and not np.isfinite(contact.witness_world).all():
         raise ValueError(f"object {body.name}: the contact has neither points nor a witness")
-    probe = _Probe(body, certifier, engine)
-    if probe.touches(before):
-        return FirstContact(0.0, 1.0, probe.patch_center(before), "touches before")
-    between = Between(before, after, windows_of(before.views, body))
+
+    def probe_at(fraction: float) -> _Probe:
+        return _Probe(body if body_at is None else body_at(fraction), certifier, engine)
+
+    if probe_at(0.0).touches(before):
+        return FirstContact(0.0, 1.0, probe_at(0.0).patch_center(before), "touches before")
+    if body_at is None:
+        windows = windows_of(before.views, body)
+    else:  # it may pass through any part of an image
+        windows = [(0, height, 0, width) for width, height in before.views.sizes_px.tolist()]
+    between = Between(before, after, windows)
     free, touching = 0.0, 1.0
     last_free, first_touching = before, after
     for step in range(1, _N_COARSE + 1):
         fraction = step / _N_COARSE
         hull = between.hull(fraction)
-        if probe.touches(hull):
+        if probe_at(fraction).touches(hull):
             touching, first_touching = fraction, hull
             break
         free, last_free = fraction, hull
@@ -149,14 +164,14 @@ def first_contact(
     while touching - free > _RESOLUTION:
         middle = 0.5 * (free + touching)
         hull = between.hull(middle)
-        if probe.touches(hull):
+        if probe_at(middle).touches(hull):
             touching, first_touching = middle, hull
         else:
             free, last_free = middle, hull
-    point_world = probe.patch_center(first_touching)
+    point_world = probe_at(touching).patch_center(first_touching)
     outlines = between.outlines(touching)
     if _outline_is_lost(outlines, last_free, first_touching, touching, point_world):
-        return FirstContact(0.5, 0.5, probe.patch_center(after), "outline lost")
+        return FirstContact(0.5, 0.5, probe_at(1.0).patch_center(after), "outline lost")
     return FirstContact(touching, max(touching, 1.0 - touching), point_world, "")
 
 

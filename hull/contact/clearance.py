@@ -15,15 +15,19 @@ of the hull beneath the surface. That depth is *not* the way that separates the 
 through the middle of a box is as deep as half the box is thick.
 
 Distances at corners of cubes depend on the object alone. They are kept from frame to frame, in the
-object's frame, and serve wherever it is moved to. What is found depends on the hull, the object and
-its place only, never on what was asked before.
+object's frame, and serve wherever it is moved to: of one that moves (`ClearanceMeter.at`) the hull
+is asked in that frame, as cameras see it that move the other way. What is found depends on the
+hull, the object and its place only, never on what was asked before.
 """
 
+import copy
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.pose import Pose, invert, placed
 from hybridve.hull.cad.distance import SurfaceDistance
 from hybridve.hull.contact.lattice import (
     FINEST_LEVEL,
@@ -35,7 +39,7 @@ from hybridve.hull.contact.lattice import (
 from hybridve.hull.query.cells import CellFrame, make_cell_frame, split_cells
 from hybridve.hull.query.engine import checked_vertices
 from hybridve.hull.query.points import are_inside
-from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.silhouettes import Hull, seen_from
 
 #: Half of the first root's edge at least, metres, and in sizes of the object. Farther than 16 times
 #: that is not looked.
@@ -149,16 +153,24 @@ class NearCells:
     @property
     def center_world(self) -> NDArray[np.float64]:
         """The centres (N, 3), metres."""
-        return np.asarray(self._level.center + self._meter._origin_world)
+        return self._meter._in_world(self._level.center)
 
     @property
     def half_m(self) -> float:
         """Half of an edge."""
         return self._level.half_m
 
+    @property
+    def reach_world(self) -> NDArray[np.float64]:
+        """How far a cube reaches from its centre along each axis of the world, (3,) metres."""
+        world_from_rest = self._meter.world_from_rest
+        if world_from_rest is None:
+            return np.full(3, self.half_m)
+        return np.asarray(self.half_m * np.abs(world_from_rest[:, :3]).sum(axis=1))
+
     def places(self, points_world: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return which place of their lattice points (M, 3) lie in: three whole numbers each."""
-        local = points_world - self._meter._origin_world
+        local = self._meter._local(points_world)
         return np.asarray(np.floor(local / (2.0 * self.half_m)), np.int64)
 
     def measure(self, kept: NDArray[np.bool_]) -> Clearance:
@@ -200,6 +212,8 @@ class ClearanceMeter:
     error_m : float
         What a distance within reach may be off by, metres: rounding, some 1e-12, and how far
         corners that meet are apart, if they are. The bounds of `measure` allow for it.
+    world_from_rest : (3, 4) float64 or None
+        Where the object stands, seen from the vertices given; None if they are where it stands.
     """
 
     def __init__(
@@ -217,12 +231,14 @@ class ClearanceMeter:
             raise ValueError("the object has no triangle to measure from")
         vertices_world = checked_vertices(vertices_world)
         used = vertices_world[faces.ravel()]
-        self._origin_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
+        # Of the local frame, in which distances are known, at rest.
+        self._origin = (used.min(axis=0) + used.max(axis=0)) / 2.0
+        self.world_from_rest: Pose | None = None
         size_m = float((used.max(axis=0) - used.min(axis=0)).max()) / 2.0
         self.is_closed = is_closed
         self.tolerance_m = tolerance_m
         self._surface = SurfaceDistance(
-            vertices_world - self._origin_world,
+            vertices_world - self._origin,
             faces,
             is_closed=is_closed,
             solid_faces=solid_faces,
@@ -234,11 +250,52 @@ class ClearanceMeter:
         self._rounding_m = self._surface.error_m(_FARTHEST * self._roots_m[-1])
         # Distances are to the triangles; the surface that decides about inside may be `apart_m`
         # from them.
-        self.error_m = (
+        self.error_m = self._error_at_rest_m = (
             self._surface.apart_m
             + self._rounding_m
-            + _ROUNDOFF * (self._roots_m[-1] + float(np.abs(self._origin_world).max()))
+            + _ROUNDOFF * (self._roots_m[-1] + float(np.abs(self._origin).max()))
         )
+
+    def at(self, world_from_rest: Pose) -> Self:
+        """Return the meter of the object moved rigidly; what is known of distances is shared.
+
+        Parameters
+        ----------
+        world_from_rest : (3, 4) float64
+            Where it stands, seen from the vertices that the meter of the object at rest was given,
+            metres.
+        """
+        moved = copy.copy(self)
+        moved.world_from_rest = world_from_rest
+        # Turned and shifted, points and projections lose some tens of u of a root's edge, for
+        # which `_ROUNDOFF` has room, and as much of the way to where the object stands.
+        moved.error_m = self._error_at_rest_m + _ROUNDOFF * float(
+            np.abs(world_from_rest[:, 3]).max()
+        )
+        return moved
+
+    def _local(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points (N, 3) in the local frame, metres."""
+        if self.world_from_rest is not None:
+            points_world = placed(points_world, invert(self.world_from_rest))
+        return np.asarray(points_world - self._origin)
+
+    def _in_world(
+        self, points_local: NDArray[np.float64], shift_rest: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return points (N, 3) of the local frame in the world, that frame shifted if it is."""
+        origin = self._origin if shift_rest is None else self._origin + shift_rest
+        points_rest = np.asarray(points_local + origin)
+        if self.world_from_rest is None:
+            return points_rest
+        return placed(points_rest, self.world_from_rest)
+
+    def _asked(self, hull: Hull, shift_rest: NDArray[np.float64] | None = None) -> CellFrame:
+        """Return a hull as cells of the local frame ask it."""
+        if self.world_from_rest is not None:
+            hull = seen_from(hull, self.world_from_rest)
+        origin = self._origin if shift_rest is None else self._origin + shift_rest
+        return make_cell_frame(hull, origin, self._roots_m[-1])
 
     def closest(
         self, points_world: NDArray[np.float64]
@@ -247,15 +304,15 @@ class ClearanceMeter:
 
         All in metres, world frame; distances are not negative.
         """
-        distance_m, nearest, triangle = self._surface.closest(points_world - self._origin_world)
-        return distance_m, nearest + self._origin_world, triangle
+        distance_m, nearest, triangle = self._surface.closest(self._local(points_world))
+        return distance_m, self._in_world(nearest), triangle
 
     def signed_distance(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distances (N,) of points (N, 3), metres, negative inside a closed object.
 
         Within reach they are right to `error_m`.
         """
-        return self._surface.signed(points_world - self._origin_world)[0]
+        return self._surface.signed(self._local(points_world))[0]
 
     def measure(
         self,
@@ -277,9 +334,10 @@ class ClearanceMeter:
             Stop early, with bounds farther apart than the tolerance, once the signed distance
             (`Clearance.signed_m`) is certainly above the one or below the other.
         """
-        shift_world = np.zeros(3) if shift_world is None else shift_world
-        origin_world = self._origin_world + shift_world
-        asked = make_cell_frame(hull, origin_world, self._roots_m[-1])
+        shift_rest = np.zeros(3) if shift_world is None else shift_world
+        if self.world_from_rest is not None:
+            shift_rest = self.world_from_rest[:, :3].T @ shift_rest
+        asked = self._asked(hull, shift_rest)
         if self._lattice.is_large:
             self._lattice.forget()
         best = Best(np.full(1, np.inf), np.full(3, np.nan))
@@ -290,17 +348,16 @@ class ClearanceMeter:
             lowest_m = self._search(root_m, best, asked, stop_above_m, stop_below_m)
             if best.distance_m[0] <= beyond_m or min(lowest_m, beyond_m) > stop_above_m:
                 break
-        return self._found(best, min(lowest_m, beyond_m), shift_world)
+        return self._found(best, min(lowest_m, beyond_m), shift_rest)
 
-    def _found(self, best: Best, lowest_m: float, shift_world: NDArray[np.float64]) -> Clearance:
+    def _found(self, best: Best, lowest_m: float, shift_rest: NDArray[np.float64]) -> Clearance:
         """Return what a search found: the best point, and a bound of all others."""
-        origin_world = self._origin_world + shift_world
         upper_m: float = np.inf
         on_object = best.point
         if best.distance_m[0] < np.inf:  # the exact distance of the best point
             signed_m, nearest = self._surface.signed(best.point[None])
             upper_m, on_object = float(signed_m[0]), nearest[0]
-        error_m = self.error_m + _ROUNDOFF * float(np.abs(shift_world).max())
+        error_m = self.error_m + _ROUNDOFF * float(np.abs(shift_rest).max())
         least_m = min(lowest_m, upper_m) - error_m
         if upper_m > error_m:
             upper_m += error_m
@@ -309,8 +366,8 @@ class ClearanceMeter:
         return Clearance(
             lower_m=max(least_m, 0.0),
             upper_m=max(upper_m, 0.0),
-            on_object_world=on_object + origin_world,
-            on_hull_world=best.point + origin_world,
+            on_object_world=self._in_world(on_object[None], shift_rest)[0],
+            on_hull_world=self._in_world(best.point[None], shift_rest)[0],
             depth_lower_m=max(-upper_m, 0.0) if self.is_closed else np.nan,
             depth_upper_m=max(-least_m, 0.0) if self.is_closed else np.nan,
         )
@@ -344,7 +401,7 @@ class ClearanceMeter:
         most : int
             Larger cubes are returned where there were more than so many.
         """
-        asked = make_cell_frame(hull, self._origin_world, self._roots_m[-1])
+        asked = self._asked(hull)
         root_m = next(
             (root for root in self._roots_m if root - self._size_m > within_m), self._roots_m[-1]
         )

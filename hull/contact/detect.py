@@ -167,6 +167,16 @@ def make_body(
     )
 
 
+def moved_body(body: Body, scene_object: SceneObject) -> Body:
+    """Return a body where its object stands, which has moved rigidly since it was made.
+
+    Its triangles keep their viewports, order and numbers.
+    """
+    lower, upper = scene_object.box_world
+    triangles = body.triangles.moved(scene_object.vertices_world)
+    return replace(body, triangles=triangles, lower_world=lower, upper_world=upper)
+
+
 def detect_contacts(hull: Hull, bodies: list[Body], engine: Engine) -> list[Contact]:
     """Return for each body its contact with the hull of one frame, as its samples tell it."""
     if not bodies:

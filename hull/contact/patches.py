@@ -130,8 +130,8 @@ def _near(cells: NearCells, cubes: NDArray[np.bool_], required_m: float) -> Patc
         clearance.on_object_world,
         clearance.on_hull_world,
         (clearance.lower_m, clearance.upper_m),
-        center_world.min(axis=0) - cells.half_m,
-        center_world.max(axis=0) + cells.half_m,
+        center_world.min(axis=0) - cells.reach_world,
+        center_world.max(axis=0) + cells.reach_world,
         0,
         0,
     )

@@ -79,7 +79,8 @@ class MovedObject:
     Attributes
     ----------
     meter : ClearanceMeter
-        Measures it, in its place at shift 0, to `METER_SHARE` of the move's tolerance.
+        Measures it, in its place at shift 0, to `METER_SHARE` of the move's tolerance. Of one that
+        moves by itself, as it stands in the frame.
     clearance_m : float
         How far real things are to stay away, not negative.
     """

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.pose import nearest_to_axes, rotation_of, rotation_vector
+from hybridve.calib.pose import Pose, nearest_to_axes, rotation_of, rotation_vector
 from hybridve.hull.query.frame import Frame
 
 Unseen = Literal["carve", "keep"]
@@ -475,6 +475,28 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
     for images in (hull.masks_flat, hull.answers_flat, hull.integrals_flat):
         images.flags.writeable = False
     return hull
+
+
+def seen_from(hull: Hull, world_from_own: Pose) -> Hull:
+    """Return the hull as an object that moved rigidly has it about itself; images are shared.
+
+    Of the hull returned, "world" is the object's own frame: a point of that frame is in it if the
+    point that it is in the world is in `hull`, but for the rounding of the projections.
+
+    Parameters
+    ----------
+    hull : Hull
+        In the world.
+    world_from_own : (3, 4) float64
+        Where the object's own frame lies, metres.
+    """
+    views = hull.views
+    rotation, translation = world_from_own[:, :3], world_from_own[:, 3]
+    # Both local frames have one origin, so that the last column stays, and no size is lost.
+    matrices = views.img_from_local.copy()
+    matrices[:, :, :3] = views.img_from_local[:, :, :3] @ rotation
+    origin_own = rotation.T @ (views.origin_world - translation)
+    return replace(hull, views=replace(views, img_from_local=matrices, origin_world=origin_own))
 
 
 def hull_of(hull: Hull, cameras: NDArray[np.int64]) -> Hull:

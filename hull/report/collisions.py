@@ -35,7 +35,7 @@ class StoredMesh:
         The triangles in the order in which runs go on through them.
     placement : (1 or F, 3, 4) float64
         From the frame of the mesh to the report's, metres about its local origin: where the object
-        stood; of one that moves, a row a frame.
+        stood; of one that moves, a row a frame, NaN where that is not known.
     """
 
     vertices_m: NDArray[np.float64]

@@ -69,7 +69,7 @@ FRAME_COLUMNS: tuple[Column[FrameResult], ...] = (
         "state",
         "1",
         "exact",
-        "evaluated; unread: pictures or the pose of a camera are missing or damaged; "
+        "evaluated; unread: pictures or the pose of a camera or an object are missing or damaged; "
         "contradictory: the silhouettes cannot all be right, and nothing is said of the objects",
         str,
         lambda result: result.state,
@@ -747,7 +747,7 @@ MESH_COLUMNS: tuple[Column[StoredMesh], ...] = (
         "1",
         "exact",
         "[R | t] with x = R vertex + t, metres about the local origin: as it stood; of an object "
-        "that moves, a row a frame",
+        "that moves, a row a frame, NaN where that is not known",
         np.float64,
         lambda mesh: mesh.placement,
         shape=(3, 4),

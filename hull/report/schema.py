@@ -5,13 +5,14 @@ values. Writing, taking up a run that was cut off, and reading all go by the tab
 a new number in a report is one more line in one of them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.pose import Pose
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.machine import Run
 from hybridve.hull.report.result_file import Described
@@ -147,6 +148,10 @@ class ReportHeader:
         Places in the file are metres about this point of the world.
     meshes : tuple of StoredMesh
         Per object.
+    placements : tuple of mappings of int to (3, 4) float64, or None
+        Per object that moves, by frame of the session where its mesh stood, as a mesh's placement;
+        frames in which that is not known have none. None of one that stands as its mesh says, as
+        they all do if this is empty.
     points : "sample" or "all"
         Whether all collision points are spelt out, or only a sample of them for pictures.
     """
@@ -161,6 +166,7 @@ class ReportHeader:
     cameras: tuple[str, ...] = ()
     local_origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     meshes: tuple[StoredMesh, ...] = ()
+    placements: tuple[Mapping[int, Pose] | None, ...] = ()
     points: Literal["sample", "all"] = "sample"
 
 

@@ -344,8 +344,7 @@ class SimulationWriter:
                     block,
                     group.shown.faces,
                     vertices_at,
-                    n_frames,
-                    moves=bool(group.shown.column),
+                    np.arange(n_frames) * bool(group.shown.column),
                 )
         for label, (name, mesh) in zip(labels[len(groups) :], standing, strict=True):
             vertices_m = mesh[_VERTICES.name][:]
@@ -353,8 +352,7 @@ class SimulationWriter:
                 collection.block(label, name),
                 mesh[_FACES.name][:],
                 lambda _, vertices_m=vertices_m: vertices_m,  # type: ignore[misc]
-                n_frames,
-                moves=False,
+                np.zeros(n_frames, np.int64),
             )
 
     def __enter__(self) -> Self:

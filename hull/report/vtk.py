@@ -1,14 +1,16 @@
 """``/VTKHDF``: the same report as ParaView and VTK read it.
 
 A report is a VTKHDF file too: a collection with, for each object, its CAD where it stood, and its
-collision points frame after frame. The CAD stands there once for all frames, unless it moves.
-Unless all are asked for, the points are a sample: every k-th of an object in a frame, at most
+collision points frame after frame. The CAD stands there once for each place that it was
+at. Unless all are asked for, the points are a sample: every k-th of an object in a frame, at most
 `MOST_SHOWN`, as attributes say.
 """
 
 from collections.abc import Iterable, Sequence
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.vtk_blocks import (
@@ -51,11 +53,20 @@ def add_vtkhdf(
             collection.block(label, name),
             mesh.faces,
             mesh.vertices_at,
-            n_frames,
-            moves=len(mesh.placement) > 1,
+            _shown_rows(mesh, n_frames),
         )
         shown = collection.block(f"{label}_points", name)
         shown.attrs["sample"] = is_sample
         if is_sample:
             shown.attrs["points_each_frame_at_most"] = MOST_SHOWN
         add_points(shown, parts)
+
+
+def _shown_rows(mesh: StoredMesh, n_frames: int) -> NDArray[np.int64]:
+    """Return the first frame in which a mesh stood where it does in each (F,); -1 if not known."""
+    placement = np.broadcast_to(mesh.placement, (n_frames, 3, 4)).reshape(n_frames, 12)
+    known = np.flatnonzero(np.isfinite(placement).all(axis=1))
+    _, first, place = np.unique(placement[known], axis=0, return_index=True, return_inverse=True)
+    rows = np.full(n_frames, -1, np.int64)
+    rows[known] = known[first][place.ravel()]
+    return rows

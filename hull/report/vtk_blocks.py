@@ -97,35 +97,46 @@ def add_surface(
     block: h5py.Group,
     faces: NDArray[np.int32],
     vertices_at: Callable[[int], NDArray[np.floating]],
-    n_frames: int,
-    *,
-    moves: bool,
+    shown: NDArray[np.int64],
 ) -> None:
-    """Add a mesh that every frame shows where it stood; of one that moves, a row of points each.
+    """Add a mesh that every frame shows where it stood.
 
-    `vertices_at` gives the vertices (V, 3) in a frame, metres about the file's local origin; of a
-    mesh that does not move only those of frame 0 are asked for.
+    `vertices_at` gives the vertices (V, 3) in a frame, metres about the file's local origin.
+    `shown` (F,) names for each frame one whose vertices it shows, for all frames in which they are
+    the same the same one; -1 in a frame that shows nothing, for which there is a second part that
+    has nothing.
     """
-    n_triangles = len(faces)
+    n_frames, n_triangles = len(shown), len(faces)
+    is_there = shown >= 0
+    rows, place = np.unique(shown[is_there], return_inverse=True)
     points = _growing(block, "Points", (3,), np.float32)
     n_vertices = 0
-    for row in range(n_frames if moves else 1):
+    for row in rows.tolist():
         vertices_m = vertices_at(row)
         n_vertices = len(vertices_m)
         _append(points, vertices_m.astype(np.float32))
+    points_before = np.zeros(n_frames, np.int64)
+    points_before[is_there] = n_vertices * place
+    cells_before = np.zeros((n_frames, len(_CELLS)), np.int64)
     every = np.ones(n_frames, np.int64)
+    if not is_there.all():
+        every = np.asarray(np.arange(max(n_frames, 2)) == 0, np.int64)
     _store(block, "NumberOfPoints", n_vertices * every)
     for number, kind in enumerate(_CELLS):
         n_cells = n_triangles if number == _POLYGONS else 0
         _store(block, f"{kind}/NumberOfCells", n_cells * every)
         _store(block, f"{kind}/NumberOfConnectivityIds", 3 * n_cells * every)
-        _store(block, f"{kind}/Offsets", 3 * np.arange(n_cells + 1, dtype=np.int64))
+        offsets = 3 * np.arange(n_cells + 1, dtype=np.int64)
+        if not is_there.all():
+            offsets = np.append(offsets, 0)
+            cells_before[~is_there, number] = n_cells
+        _store(block, f"{kind}/Offsets", offsets)
         corners = faces.ravel() if n_cells else faces.ravel()[:0]
         _append(_growing(block, f"{kind}/Connectivity", (), np.int64), corners.astype(np.int64))
     steps = _add_steps(block, n_frames)
-    _store(steps, "PartOffsets", 0 * every)
-    _store(steps, "PointOffsets", n_vertices * np.arange(n_frames) * int(moves))
-    _store(steps, "CellOffsets", np.zeros((n_frames, len(_CELLS)), np.int64))
+    _store(steps, "PartOffsets", np.asarray(~is_there, np.int64))
+    _store(steps, "PointOffsets", points_before)
+    _store(steps, "CellOffsets", cells_before)
     _store(steps, "ConnectivityIdOffsets", np.zeros((n_frames, len(_CELLS)), np.int64))
 
 

@@ -50,9 +50,11 @@ from hybridve.hull.report.vtk import MOST_SHOWN, add_vtkhdf
 from hybridve.hull.report.vtk_blocks import FramePoints
 from hybridve.hull.report.withdraw import doubted, withdrawn
 
-#: A part is finished after this many frames or runs of collision points, whichever comes first.
+#: A part is finished after this many frames, runs of collision points, or vertices of objects that
+#: move, which each frame has anew; whichever comes first.
 _PART_FRAMES = 64
 _PART_RUNS = 250_000
+_PART_VERTICES = 4_000_000
 
 #: Rows in one chunk of the file, of those that have many.
 _CHUNK_ROWS = 16_384
@@ -91,7 +93,7 @@ class ReportWriter:
         self._header = header
         self._parts = path.with_name(path.name + ".parts")
         self._pending: list[FrameResult] = []
-        self._n_pending_runs = 0
+        self._n_pending_runs = self._n_pending_vertices = 0
         self.n_done = 0
         self._write_s = 0.0
         refuse_existing(path, overwrite=overwrite)
@@ -135,7 +137,16 @@ class ReportWriter:
         """Take in one frame's result."""
         self._pending.append(result)
         self._n_pending_runs += sum(len(finding.contact.hits.start) for finding in result.findings)
-        if len(self._pending) >= _PART_FRAMES or self._n_pending_runs >= _PART_RUNS:
+        self._n_pending_vertices += sum(
+            len(finding.contact.body.triangles.vertices_world)
+            for finding, moves in zip(result.findings, self._header.placements, strict=False)
+            if moves is not None
+        )
+        if (
+            len(self._pending) >= _PART_FRAMES
+            or self._n_pending_runs >= _PART_RUNS
+            or self._n_pending_vertices >= _PART_VERTICES
+        ):
             self._flush()
 
     def _flush(self) -> None:
@@ -148,7 +159,7 @@ class ReportWriter:
         with appearing(part) as partial, partial.open("wb") as file:
             np.savez(file, **columns)  # type: ignore[arg-type]  # the stub takes the names for options
         self.n_done += len(self._pending)
-        self._pending, self._n_pending_runs = [], 0
+        self._pending, self._n_pending_runs, self._n_pending_vertices = [], 0, 0
         self._write_s += time.perf_counter() - started
 
     def take_write_s(self) -> float:
@@ -225,6 +236,7 @@ class ReportWriter:
             raise ReportError(f"{self._path}: no frame was evaluated; there is nothing to report")
         whole = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
         self._take_back(whole, agreement)
+        meshes = self._meshes(whole[_frame_key("index")])
         frames = file.create_group("hybridve/frames")
         for column in FRAME_COLUMNS:
             self._store(frames, column, whole[_frame_key(column.name)])
@@ -255,15 +267,31 @@ class ReportWriter:
             ):
                 key = partial(_object_key, number)
                 self._store_many(group, key, offset, columns, whole[key(count)])
-            self._store_mesh(file, group, header.meshes[number])
+            self._store_mesh(file, group, meshes[number])
             if header.points == "all":
-                self._store_points(group, number, whole[_object_key(number, "n_points")])
+                n_points = whole[_object_key(number, "n_points")]
+                self._store_points(group, number, meshes[number], n_points)
         add_vtkhdf(
             file,
             [about["name"] for about in header.objects],
-            header.meshes,
-            [self._points(number) for number in range(len(header.objects))],
+            meshes,
+            [self._points(number, mesh) for number, mesh in enumerate(meshes)],
             is_sample=header.points == "sample",
+        )
+
+    def _meshes(self, index: NDArray[np.uint32]) -> tuple[StoredMesh, ...]:
+        """Return the meshes as they stood in frames (F,); NaN where that is not known."""
+        header = self._header
+        if not header.placements:
+            return header.meshes
+        nowhere = np.full((3, 4), np.nan)
+        return tuple(
+            mesh
+            if poses is None
+            else replace(
+                mesh, placement=np.array([poses.get(frame, nowhere) for frame in index.tolist()])
+            )
+            for mesh, poses in zip(header.meshes, header.placements, strict=True)
         )
 
     def _take_back(self, whole: dict[str, NDArray[Any]], agreement: SessionAgreement) -> None:
@@ -308,13 +336,17 @@ class ReportWriter:
             parts = (part[key] for part in self._part_columns(partial(operator.eq, key)))
             self._store_parts(group, column, int(ends[-1]), parts)
 
-    def _store_points(self, group: h5py.Group, number: int, n_points: NDArray[np.uint64]) -> None:
+    def _store_points(
+        self, group: h5py.Group, number: int, mesh: StoredMesh, n_points: NDArray[np.uint64]
+    ) -> None:
         ends = np.concatenate([[0], np.cumsum(n_points, dtype=np.uint64)]).astype(np.uint64)
         self._store(group, POINT_OFFSET, ends)
         xyz_m, triangle = POINT_COLUMNS
         total = int(ends[-1])
-        self._store_parts(group, xyz_m, total, (part.xyz_m for part in self._points(number)))
-        self._store_parts(group, triangle, total, (part.triangle for part in self._points(number)))
+        self._store_parts(group, xyz_m, total, (part.xyz_m for part in self._points(number, mesh)))
+        self._store_parts(
+            group, triangle, total, (part.triangle for part in self._points(number, mesh))
+        )
 
     def _store_parts(
         self, group: h5py.Group, column: Column[Any], total: int, parts: Iterator[NDArray[Any]]
@@ -352,9 +384,9 @@ class ReportWriter:
                 self._store(group, column, column.take(mesh))
         group["mesh"].attrs["sha256"] = digest
 
-    def _points(self, number: int) -> Iterator[FramePoints]:
+    def _points(self, number: int, mesh: StoredMesh) -> Iterator[FramePoints]:
         """Yield of each part the collision points of an object, all or a sample of them."""
-        mesh, row = self._header.meshes[number], 0
+        row = 0
         most = MOST_SHOWN if self._header.points == "sample" else None
         names = ("n_runs", *(column.name for column in RUN_COLUMNS))
         keys = [_object_key(number, name) for name in names]

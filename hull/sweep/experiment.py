@@ -164,7 +164,7 @@ def _answer_in_time(
         answers = answer_of(room, frame, row)
         answered = clock()
         for index, hits in answers.items():
-            collision_points(row.bodies[index], hits)
+            collision_points(frame.body(index, row.bodies[index]), hits)
         query_s += answered - started
         place_s += clock() - answered
     return query_s / len(frames), place_s / len(frames)

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SessionError
+from hybridve.calib.pose import Pose, placed
 from hybridve.hull.capture.recording import FrameRange
-from hybridve.hull.chain import Chain, hulls
+from hybridve.hull.chain import Chain, hulls, standing_at
 from hybridve.hull.contact.detect import Body
 from hybridve.hull.query.bounds import boxes_are_free
+from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.silhouettes import Hull, make_hull
 
 _log = logging.getLogger(__name__)
@@ -39,6 +41,9 @@ class HullFrame:
         Which bodies' boxes are not proved free.
     decode_s, segment_s, hull_s, boxes_s : float
         What that took.
+    world_from_rest : tuple of (3, 4) float64 or None
+        Where each body is, seen from where the scene places it; None of one that does not move, as
+        they all do not if this is empty.
     """
 
     index: int
@@ -48,6 +53,17 @@ class HullFrame:
     segment_s: float
     hull_s: float
     boxes_s: float
+    world_from_rest: tuple[Pose | None, ...] = ()
+
+    def mesh(self, number: int, mesh: Triangles) -> Triangles:
+        """Return the mesh of a body, by number, where that is in this frame."""
+        pose = self.world_from_rest[number] if self.world_from_rest else None
+        return mesh if pose is None else mesh.moved(placed(mesh.vertices_world, pose))
+
+    def body(self, number: int, body: Body) -> Body:
+        """Return a body, by number, with its mesh where it is in this frame."""
+        mesh = self.mesh(number, body.triangles)
+        return body if mesh is body.triangles else replace(body, triangles=mesh)
 
 
 def spread_frames(n_frames: int, most: int = MOST_FRAMES) -> FrameRange:
@@ -97,15 +113,17 @@ def read_hulls(
                     f"{chain.session.path}: the hulls of {len(frames)} frames fill "
                     f"{_MOST_BYTES >> 30} GiB of memory; take fewer with --frames START:STOP:STEP"
                 )
+            standing = standing_at(chain, frame.index)
             frames.append(
                 HullFrame(
                     frame.index,
                     hull,
-                    near_bodies(hull, chain.bodies),
+                    near_bodies(hull, standing.bodies),
                     frame.decode_s,
                     frame.segment_s,
                     0.0,
                     0.0,
+                    standing.world_from_rest,
                 )
             )
     if not frames:
@@ -120,10 +138,11 @@ def _timed(frame: HullFrame, chain: Chain) -> HullFrame:
     """Return a frame with the seconds of its hull and boxes, now that nothing else runs."""
     views = frame.hull.views
     masks = [frame.hull.mask(camera) for camera in range(len(views))]
+    bodies = standing_at(chain, frame.index).bodies
     started = time.perf_counter()
     hull = make_hull(views, masks)
     made = time.perf_counter()
-    near_bodies(hull, chain.bodies)
+    near_bodies(hull, bodies)
     return replace(frame, hull_s=made - started, boxes_s=time.perf_counter() - made)
 
 

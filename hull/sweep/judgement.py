@@ -129,7 +129,9 @@ def find_truth(
         started = time.perf_counter()
         found.append(
             {
-                index: certify_body(frame.hull, bodies[index], certify, open_at_m)
+                index: certify_body(
+                    frame.hull, frame.body(index, bodies[index]), certify, open_at_m
+                )
                 for index in np.flatnonzero(frame.near).tolist()
             }
         )
@@ -156,8 +158,9 @@ def find_truth(
             started = time.perf_counter()
             for index, one in found[number].items():
                 if (one.verdict != FREE).any():
+                    mesh = frame.mesh(index, dense[index])
                     found[number][index] = room.call(
-                        sample_body, frame.hull, one, dense[index], room.engine, TRUTH_POINTS
+                        sample_body, frame.hull, one, mesh, room.engine, TRUTH_POINTS
                     )
             sample_s[number] = time.perf_counter() - started
     open_most_m = max((one.open_at_m for frame in found for one in frame.values()), default=0.0)
@@ -213,7 +216,7 @@ def _judge_row(
             if one.collides and len(hits) == 0:
                 objects_missed += 1
             # Done even where the answer is known already: to warm up.
-            reported_world, _ = collision_points(row.bodies[index], hits)
+            reported_world, _ = collision_points(frame.body(index, row.bodies[index]), hits)
             true_world = np.concatenate([one.witnesses_world, one.dense_world])
             if len(hits) == 0 or len(true_world) == 0:
                 continue
@@ -239,7 +242,8 @@ def answer_of(room: EngineRoom, frame: HullFrame, row: Row) -> dict[int, Hits]:
     room.raise_if_left()
     near = np.flatnonzero(frame.near).tolist()
     hull = replace(frame.hull)  # the same arrays, but a hull that no engine has seen
-    hits = room.engine.query(hull, [row.bodies[index].triangles for index in near])
+    meshes = [frame.mesh(index, row.bodies[index].triangles) for index in near]
+    hits = room.engine.query(hull, meshes)
     return dict(zip(near, hits, strict=True))
 
 
