@@ -1,13 +1,15 @@
 """TOML files that users write: read, checked, and what is wrong told in one line."""
 
 import codecs
+import difflib
 import os
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from hybridve.calib.errors import HybridveError
 
@@ -50,26 +52,75 @@ def _decoded(text: bytes) -> str:
 
 
 def explain_validation(
-    error: ValidationError, path: Path, within: tuple[str | int, ...] = ()
+    error: ValidationError,
+    path: Path,
+    model: type[BaseModel] | None = None,
+    within: tuple[str | int, ...] = (),
 ) -> str:
-    """Return one line for the first thing that is wrong: file, key, what was found and expected.
+    """Return one line for what is wrong: file, key, what was found and expected.
 
-    `within` leads to the table that was checked, in a file that holds more.
+    A key that does not exist names the one that it is most like.
+
+    Parameters
+    ----------
+    error : ValidationError
+        What pydantic says.
+    path : Path
+        The file.
+    model : type of BaseModel, optional
+        What was validated, for the keys that there are.
+    within : tuple
+        Leads to the table that was checked, in a file that holds more.
     """
-    first = error.errors()[0]
-    place = [str(part + 1) if isinstance(part, int) else part for part in (*within, *first["loc"])]
-    key = ".".join(place)
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        message = "there is no such key; look for a spelling mistake"
-    elif first["type"] == "missing":
-        message = "this key is missing"
-    elif first["type"] != "value_error":
-        found = repr(first["input"])
-        message = f"{message}, found {found if len(found) <= 60 else found[:57] + '...'}"
-    more = error.error_count() - 1
-    tail = f" (and {more} more)" if more else ""
-    return f"{path}: {key + ': ' if key else ''}{message}{tail}"
+    problems = []
+    for one in error.errors():
+        loc = one["loc"]
+        key = ".".join(str(part + 1) if isinstance(part, int) else part for part in (*within, *loc))
+        message = one["msg"].removeprefix("Value error, ")
+        if one["type"] == "extra_forbidden":
+            message = f"there is no such key{like(str(loc[-1]), _keys_at(model, loc))}"
+        elif one["type"] == "missing":
+            message = "this key is missing"
+        elif one["type"] != "value_error":
+            found = repr(one["input"])
+            message = f"{message}, found {found if len(found) <= 60 else found[:57] + '...'}"
+        # A table's own complaint begins with the key that it is about.
+        about_key = one["type"] == "value_error" and re.match(r"\w+: ", message)
+        between = "." if key and about_key else ": " if key else ""
+        problems.append(f"{key}{between}{message}")
+    more = len(problems) - _MOST_PROBLEMS
+    tail = f" (and {more} more)" if more > 0 else ""
+    return f"{path}: {'; '.join(problems[:_MOST_PROBLEMS])}{tail}"
+
+
+#: Problems that one line tells.
+_MOST_PROBLEMS = 4
+
+
+def like(key: str, known: Sequence[str]) -> str:
+    """Return, for a message, the key that another is most like, or those that there are."""
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.7)
+    if close:
+        return f"; did you mean {close[0]}?"
+    return f"; there are {', '.join(known)}" if known else "; look for a spelling mistake"
+
+
+def _keys_at(model: type[BaseModel] | None, loc: tuple[str | int, ...]) -> list[str]:
+    """Return the keys of the table in which a key stands, by the model of the whole."""
+    for part in loc[:-1]:
+        if model is None or isinstance(part, int):
+            continue
+        field = model.model_fields.get(part)
+        model = None if field is None else _model_in(field.annotation)
+    return [] if model is None else list(model.model_fields)
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """Return the one model that an annotation holds, as `list[Camera]`; None for another."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    found = [model for one in get_args(annotation) if (model := _model_in(one)) is not None]
+    return found[0] if len(found) == 1 else None
 
 
 def expand_root(root: str, path: Path, error_class: type[HybridveError]) -> Path:

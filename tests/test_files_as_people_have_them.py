@@ -103,3 +103,39 @@ def test_a_name_that_cannot_be_a_folder_is_refused_in_words(tmp_path: Path, name
     with pytest.raises(SessionError, match=r"camera.2.name: found .*expected a name without") as e:
         load_session(path)
     assert "pattern" not in str(e.value)
+
+
+def test_keys_that_do_not_exist_name_what_they_are_most_like_all_in_one_go(tmp_path: Path) -> None:
+    path = write_ball_session(tmp_path, np.zeros((2, 3)), n_cameras=2)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(
+        text.replace("fps = 25", "fsp = 25").replace('name = "cam1"', 'name = "cam1"\noffset = 1'),
+        encoding="utf-8",
+    )
+
+    with pytest.raises(SessionError) as error:
+        load_session(path)
+
+    (line,) = str(error.value).splitlines()
+    assert "fsp: there is no such key; did you mean fps?" in line
+    assert "camera.2.offset: there is no such key; did you mean offset_s?" in line
+
+
+@pytest.mark.parametrize(
+    ("target", "line"),
+    [
+        ("sqare_mm = 30", "target.sqare_mm: there is no such key; did you mean square_mm?"),
+        ("square_mm = 30\nzzz = 1", "target.zzz: there is no such key; there are kind, name"),
+    ],
+)
+def test_a_mistyped_key_of_a_board_names_its_neighbour(
+    tmp_path: Path, target: str, line: str
+) -> None:
+    path = write_ball_session(tmp_path, np.zeros((2, 3)), n_cameras=2)
+    board = f'[target]\nkind = "chessboard"\ncolumns = 8\nrows = 6\n{target}\n'
+    path.write_text(path.read_text(encoding="utf-8") + board, encoding="utf-8")
+
+    with pytest.raises(SessionError) as error:
+        load_session(path)
+
+    assert line in str(error.value)

@@ -298,7 +298,7 @@ def load_scene(path: Path) -> Scene:
     try:
         parsed = _SceneTable.model_validate(table)
     except ValidationError as error:
-        raise SceneError(explain_validation(error, path)) from None
+        raise SceneError(explain_validation(error, path, _SceneTable)) from None
     for number, entry in enumerate(parsed.object, start=1):
         before = [earlier.name for earlier in parsed.object[: number - 1]]
         if entry.name in before:

@@ -30,7 +30,7 @@ from hybridve.hull.capture.session_tables import (
     TargetTable,
     WorldPoint,
 )
-from hybridve.hull.toml_io import expand_root, explain_validation, read_toml
+from hybridve.hull.toml_io import expand_root, explain_validation, like, read_toml
 
 _log = logging.getLogger(__name__)
 
@@ -212,7 +212,7 @@ def load_session(path: Path) -> Session:
     try:
         parsed = SessionTable.model_validate(table)
     except ValidationError as error:
-        raise SessionError(explain_validation(error, path)) from None
+        raise SessionError(explain_validation(error, path, SessionTable)) from None
 
     names = [camera.name for camera in parsed.camera]
     for number, name in enumerate(names):
@@ -284,8 +284,8 @@ def _parse_targets(found: Any, path: Path) -> tuple[TargetTable, ...]:
         try:
             target = TARGETS[kind].model_validate(named)
         except ValidationError as error:
-            message = explain_validation(error, path)
-            raise SessionError(message.replace(f"{path}: ", f"{path}: {place}", 1)) from None
+            within = ("target",) if is_one else ("target", number - 1)
+            raise SessionError(explain_validation(error, path, TARGETS[kind], within)) from None
         names = [other.name for other in targets]
         if target.name in names:
             raise SessionError(
@@ -371,14 +371,12 @@ def _segment_settings(table: dict[str, Any], path: Path) -> SegmentSettings:
     for key in table:
         if key not in known:
             raise SessionError(
-                f"{path}: segmentation.{key}: there is no such key; one of {', '.join(known)}"
+                f"{path}: segmentation.{key}: there is no such key{like(key, known)}"
             )
     try:
         return TypeAdapter(SegmentSettings).validate_python(table)
     except ValidationError as error:
-        raise SessionError(
-            explain_validation(error, path).replace(f"{path}: ", f"{path}: segmentation.", 1)
-        ) from None
+        raise SessionError(explain_validation(error, path, within=("segmentation",))) from None
     except ValueError as error:
         raise SessionError(f"{path}: segmentation: {error}") from None
 

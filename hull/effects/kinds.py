@@ -72,7 +72,7 @@ def read_entries(scene: Scene) -> tuple[tuple[Entry, EffectKind], ...]:
             table = kind.table.model_validate(raw)
         except ValidationError as error:
             raise SceneError(
-                explain_validation(error, scene.path, ("effect", number - 1))
+                explain_validation(error, scene.path, kind.table, ("effect", number - 1))
             ) from None
         found.append((Entry(table.name or table.default_name, table, label), kind))
     _refuse_shared([entry for entry, _ in found])
