@@ -261,7 +261,7 @@ def test_a_moving_camera_has_poses_and_masks(folder: Path) -> None:
     without_masks = '[[camera]]\nname = "left"\n'
     with pytest.raises(SessionError, match=r"camera\.1\.poses: there are no masks"):
         load_session(session_path(folder, HEAD + without_masks + moving))
-    with pytest.raises(SessionError, match=r"camera\.1: video: a camera that moves .*give masks"):
+    with pytest.raises(SessionError, match=r"camera\.1\.video: a camera that moves .*give masks"):
         load_session(session_path(folder, HEAD + without_masks + 'video = "note.avi"\n' + moving))
 
 

@@ -109,7 +109,7 @@ def test_keys_that_do_not_exist_name_what_they_are_most_like_all_in_one_go(tmp_p
     path = write_ball_session(tmp_path, np.zeros((2, 3)), n_cameras=2)
     text = path.read_text(encoding="utf-8")
     path.write_text(
-        text.replace("fps = 25", "fsp = 25").replace('name = "cam1"', 'name = "cam1"\noffset = 1'),
+        text.replace("fps = 25", "fpss = 25").replace('name = "cam1"', 'name = "cam1"\noffset = 1'),
         encoding="utf-8",
     )
 
@@ -117,7 +117,7 @@ def test_keys_that_do_not_exist_name_what_they_are_most_like_all_in_one_go(tmp_p
         load_session(path)
 
     (line,) = str(error.value).splitlines()
-    assert "fsp: there is no such key; did you mean fps?" in line
+    assert "fpss: there is no such key; did you mean fps?" in line
     assert "camera.2.offset: there is no such key; did you mean offset_s?" in line
 
 
