@@ -54,6 +54,20 @@ PLAIN_OBJ = obj(BOX, QUADS).decode()
 BINARY_STL = binary_stl(BOX, TRIANGLES)
 PLAIN_PLY = text_ply(BOX, QUADS).decode()
 PLAIN_OFF = off(BOX, QUADS).decode()
+
+
+def with_payload(stl: bytes, length: int) -> bytes:
+    """Return a binary STL with so many bytes behind each triangle, as its attribute says."""
+    records = [stl[at : at + 48] for at in range(84, len(stl), 50)]
+    behind = length.to_bytes(2, "little") + b"\1" * length
+    return stl[:84] + b"".join(record + behind for record in records)
+
+
+def comma_stl() -> str:
+    """Return the plain STL as a program of another country writes it."""
+    return PLAIN_STL.replace(".", ",")
+
+
 HALVES = [text_stl(BOX, half).decode() for half in (TRIANGLES[:5], TRIANGLES[5:])]
 FACET = "facet normal 0 0 0\n outer loop\n  vertex 0 0 0\n  vertex 1 0 0\n  vertex 0 1 0\n endloop"
 
@@ -72,6 +86,16 @@ FACET = "facet normal 0 0 0\n outer loop\n  vertex 0 0 0\n  vertex 1 0 0\n  vert
         ("named.stl", PLAIN_STL.replace("solid part", "solid facet normal vertex endsolid cover")),
         ("latin.stl", PLAIN_STL.replace("part", "Geh\u00e4use").encode("latin-1")),
         ("zeros.stl", BINARY_STL + b"\0\0"),
+        ("streamed.stl", BINARY_STL[:80] + bytes(4) + BINARY_STL[84:]),
+        ("streamed4.stl", BINARY_STL[:80] + b"\xff" * 4 + BINARY_STL[84:]),
+        ("payload.stl", with_payload(BINARY_STL, 4)),
+        ("made_by.stl", BINARY_STL + b"end of file: made by X"),
+        ("comma.stl", comma_stl()),
+        ("comma.obj", "\n".join(
+            line.replace(".", ",") if line.startswith("v ") else line
+            for line in PLAIN_OBJ.splitlines()
+        ) + "\n"),
+        ("fortran.stl", PLAIN_STL.replace("100.0", "1.0D+02")),
         ("line.stl", BINARY_STL + b"\n"),
         ("mark.obj", "\ufeff" + "\n".join(PLAIN_OBJ.splitlines()[1:]) + "\n"),
         ("wide.obj", PLAIN_OBJ.encode("utf-16")),
@@ -100,9 +124,11 @@ def test_what_programs_write_is_read_whole(tmp_path: Path, name: str, content: s
         ("a.stl", f"solid\n{FACET}\nendsolid\n", "line 8: found 'endsolid' in a facet"),
         ("a.stl", PLAIN_STL.replace("  vertex 0.0 0.0 0.0\n", "", 1), "a loop of 2 vertices"),
         ("a.stl", PLAIN_STL + "facet normal 0 0 1\n", "found 'facet normal 0 0' outside a solid"),
-        ("a.stl", BINARY_STL + b"made by", "691 bytes, where its header promises 684 for 12"),
-        ("a.stl", BINARY_STL[:80] + b"\0\0\0\0" + BINARY_STL[84:], "684 bytes, .*promises 84 "),
-        ("a.stl", BINARY_STL[:80] + b"\xff" * 4 + BINARY_STL[84:], "684 bytes, .*4294967295 tri"),
+        ("a.stl", BINARY_STL + bytes(49) + b"x", "734 bytes, .*promises 684 for 12"),
+        ("a.stl", BINARY_STL[:80] + b"\1\0\0\0" + BINARY_STL[84:], "684 bytes, .*promises 134 "),
+        ("a.stl", BINARY_STL[:80] + b"\xff" * 4 + BINARY_STL[84:-1], "683 .*4294967295 tri"),
+        ("a.stl", with_payload(BINARY_STL, 4)[:-1], "731 bytes, where its header promises 684"),
+        ("a.stl", comma_stl().replace("vertex 0,", "vertex 0.", 1), "no number; the decimal"),
         ("a.stl", b"\x01\x02\x03", "neither text nor binary STL: 3 bytes"),
         ("a.obj", PLAIN_OBJ + "surf 0 1 0 1 1 2 3 4\n", "line 16: 'surf' holds a surface"),
         ("a.obj", PLAIN_OBJ + "call more.obj\n", "line 16: 'call' holds a surface"),

@@ -11,6 +11,7 @@ References
 Wavefront, Object Files (.obj), Advanced Visualizer Manual, appendix B1.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -22,6 +23,9 @@ from hybridve.hull.cad.polygons import PolygonError, cut_polygons
 from hybridve.hull.cad.text import decode, is_ended, number, split_lines, whole
 
 _Rgba = tuple[float, float, float, float]
+
+#: Lines of numbers: vertices, their normals and places in pictures.
+_NUMBER_LINES = re.compile(r"^[ \t]*v[tn]?[ \t][^\r\n#]*", re.MULTILINE)
 
 #: Statements that name vertices and have no surface.
 _LINES = ("l", "p", "curv", "curv2")
@@ -65,6 +69,10 @@ def parse_obj(content: bytes, beside: Mapping[str, bytes]) -> Contents:
         file holds a surface that is not read.
     """
     text = decode(content)
+    numbers = "".join(_NUMBER_LINES.findall(text))
+    has_commas = "," in numbers and "." not in numbers
+    if has_commas:
+        text = _NUMBER_LINES.sub(lambda line: line[0].replace(",", "."), text)
     vertices: list[list[float]] = []
     sections = [_Section("")]
     material = ""
@@ -124,7 +132,8 @@ def parse_obj(content: bytes, beside: Mapping[str, bytes]) -> Contents:
     for library in libraries:
         colours |= _parse_mtl(beside.get(library, b""))
     parts = tuple(_part(section, points, colours, alone=len(filled) == 1) for section in filled)
-    return Contents(parts, is_ended=is_ended(text))
+    notes = ("its decimal sign is a comma, which is read as a point",) if has_commas else ()
+    return Contents(parts, is_ended=is_ended(text), notes=notes)
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:

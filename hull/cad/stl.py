@@ -1,12 +1,15 @@
 """STL files, binary and text: triangles in the order of the file, as one part.
 
-A binary file is as long as its count of triangles says, or refused: with bytes left over nobody
-knows where a triangle begins. Zeros and line ends at its very end hold nothing and may stand there.
-A text ends with ``endsolid`` or is cut off. Several solids are one part. Loops of more than three
-vertices, which the format forbids and exporters write, are cut into triangles.
+A binary file is as long as its count of triangles says, each with as many bytes of payload behind
+it as it says itself. Where the count is 0 or none, as programs leave it that write as they go, it
+is told by the length. What stands behind the last triangle and is no triangle is told, and not
+read; a file that is too short, or has more triangles than its count, is refused. A text ends with
+``endsolid`` or is cut off. Several solids are one part. Loops of more than three vertices, which
+the format forbids and exporters write, are cut into triangles.
 """
 
 import re
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +26,10 @@ _FACET = (
     *(("vertex", None, None, None) * 3),
     *("endloop", "endfacet"),
 )
+#: A count of triangles that is none.
+_UNKNOWN = 0xFFFFFFFF
+
+_VERTEX_LINES = re.compile(r"^[ \t]*(?:vertex|facet)\b[^\r\n]*", re.IGNORECASE | re.MULTILINE)
 _SOLID_LINES = re.compile(r"^[ \t]*(?:end)?solid\b[^\r\n]*", re.IGNORECASE | re.MULTILINE)
 
 
@@ -40,17 +47,53 @@ def parse_stl(content: bytes) -> Contents:
         return _parse_text(decode(content))
     if len(content) < _HEAD:
         raise ValueError(f"neither text nor binary STL: {len(content)} bytes; export it again")
+    return _parse_binary(content)
+
+
+def _parse_binary(content: bytes) -> Contents:
+    """Return the part in a binary file."""
     count = int.from_bytes(content[80:_HEAD], "little")
+    behind = len(content) - _HEAD
+    notes: tuple[str, ...] = ()
+    if count in (0, _UNKNOWN) and behind and behind % _RECORD.itemsize == 0:
+        notes = (f"its header says {count} triangles; {behind // _RECORD.itemsize} follow",)
+        count = behind // _RECORD.itemsize
     expected = _HEAD + _RECORD.itemsize * count
-    left = content[expected:]
-    if len(content) < expected or left.strip(b"\0\r\n"):
+    left = content[expected:].strip(b"\0\r\n")
+    records = None
+    if len(content) > expected:
+        records = _with_payload(content, count)
+        plain = np.frombuffer(content, _RECORD, count, _HEAD)
+        # Where triangles may have a payload, nobody knows where the next one begins.
+        is_aligned = (len(content) - expected) % _RECORD.itemsize != 0 and not plain["rest"].any()
+        if records is None and left and is_aligned:
+            notes = (f"{len(content) - expected} bytes behind its last triangle are not read",)
+            left = b""
+    if len(content) < expected or (records is None and left):
         raise ValueError(
             f"{len(content)} bytes, where its header promises {expected} for {count} triangles; "
             "export it again"
         )
-    records = np.frombuffer(content, _RECORD, count, _HEAD)
+    if records is None:
+        records = np.frombuffer(content, _RECORD, count, _HEAD)
     vertices = records["corners"].astype(np.float64).reshape(-1, 3)
-    return _contents(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
+    faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+    return replace(_contents(vertices, faces), notes=notes)
+
+
+def _with_payload(content: bytes, count: int) -> NDArray[np.void] | None:
+    """Return triangles that have bytes behind them, as many as each says; None if none has any."""
+    places, at = [], _HEAD
+    for _ in range(count):
+        end = at + _RECORD.itemsize
+        if end > len(content):
+            return None
+        places.append(at)
+        at = end + int.from_bytes(content[end - 2 : end], "little")
+    if at == _HEAD + _RECORD.itemsize * count or at != len(content):
+        return None
+    whole = b"".join(content[place : place + _RECORD.itemsize] for place in places)
+    return np.frombuffer(whole, _RECORD)
 
 
 def _contents(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> Contents:
@@ -73,6 +116,11 @@ def _is_text(content: bytes) -> bool:
 def _parse_text(text: str) -> Contents:
     """Return the part in a text, its numbers in double precision."""
     body = _SOLID_LINES.sub("", text)
+    if "," in body and "." not in body:  # decimal commas
+        text = _VERTEX_LINES.sub(lambda line: line[0].replace(",", "."), text)
+        return replace(
+            _parse_text(text), notes=("its decimal sign is a comma, which is read as a point",)
+        )
     words = body.split()
     ends = len(re.findall(r"^[ \t]*endsolid\b", text, re.IGNORECASE | re.MULTILINE))
     starts = len(re.findall(r"^[ \t]*solid\b", text, re.IGNORECASE | re.MULTILINE))

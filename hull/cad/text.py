@@ -2,6 +2,9 @@
 
 import re
 
+#: An exponent as Fortran writes it.
+_FORTRAN = re.compile(r"^([-+]?[\d.]+)[dD]([-+]?\d+)$")
+
 _LINE_ENDS = re.compile(r"\r\n|\r|\n")
 
 #: How a text may begin that says how its characters are stored; longer marks first.
@@ -51,7 +54,7 @@ def number(word: str) -> float:
     """
     try:
         if "_" not in word:  # which only Python reads
-            return float(word)
+            return float(_FORTRAN.sub(r"\1e\2", word))
     except ValueError:
         pass
     comma = "; the decimal sign is a point" if "," in word else ""
