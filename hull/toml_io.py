@@ -7,11 +7,25 @@ import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 
 from hybridve.calib.errors import HybridveError
+
+
+def _is_name(name: str) -> str:
+    """Refuse what cannot be the name of a thing: it becomes that of a folder and of a group."""
+    if not re.fullmatch(r"[^/\\\"'\s]([^/\\\"'\x00-\x1f]*[^/\\\"'\s])?", name) or name[0] == ".":
+        raise ValueError(
+            f"found {name!r}; expected a name without / \\ and quotes, that begins with no dot and "
+            "neither begins nor ends with a space"
+        )
+    return name
+
+
+#: What a thing may be called.
+Name = Annotated[str, AfterValidator(_is_name)]
 
 
 def read_toml(

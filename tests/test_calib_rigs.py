@@ -430,7 +430,7 @@ def test_middlebury_rows_are_taken_and_endings_do_not_matter(tmp_path: Path, rig
     [
         ("cam1,1,2,3\n", r"rig\.csv, line 1: 3 numbers after the name 'cam1', expected 12"),
         ("cam1," + ",".join("0" * 12), "singular"),
-        ("cam1," + ",".join(["nan"] * 12), "expected 12"),
+        ("cam1," + ",".join(["nan"] * 12), "number 1 after the name .cam1. is nan"),
         ("cam1 1 2\nrubbish here\n", "line 1"),
         ("", "holds no camera"),
         ("name,p11\n", "holds no camera"),

@@ -1,15 +1,17 @@
 """Files as people have them: names, capitals, brackets, what other systems leave behind."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from helpers.sessions import write_ball_session
+from helpers.sessions import write_ball_session, write_cube_scene
 
 from hybridve.calib.errors import SessionError
 from hybridve.calib.image_io import open_source
 from hybridve.hull.capture.session import load_session
+from hybridve.hull.report.read import read_report
 from hybridve.hull.toml_io import read_toml
 
 
@@ -139,3 +141,40 @@ def test_a_mistyped_key_of_a_board_names_its_neighbour(
         load_session(path)
 
     assert line in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_recording_with_names_with_spaces_goes_through_to_its_report(
+    run: Callable[..., int], tmp_path: Path
+) -> None:
+    session = write_ball_session(tmp_path / "my session", np.zeros((2, 3)), n_cameras=3)
+    text = session.read_text(encoding="utf-8").replace('name = "cam1"', 'name = "Camera 1"')
+    session.write_text(text, encoding="utf-8")
+    rig = session.with_name("rig.csv")
+    rig.write_text(rig.read_text(encoding="utf-8").replace("cam1,", "Camera 1,"), encoding="utf-8")
+    scene = write_cube_scene(tmp_path / "my scene", {"the box (left)": (0, 0, 0)})
+    report, rig_out = tmp_path / "a report.h5", tmp_path / "rig out"
+
+    assert run("detect", session, "--scene", scene, "-o", report) == 0
+    assert run("convert", rig, "--from-unit", "m", "--to", "colmap", "-o", rig_out,
+               "--image-size", "160x120") == 0  # fmt: skip
+
+    found = read_report(report)
+    assert list(found.objects) == ["the box (left)"]
+    assert list(found.cameras) == ["cam0", "Camera 1", "cam2"]
+    assert (
+        run(
+            "convert",
+            rig_out,
+            "--from-unit",
+            "m",
+            "--to",
+            "csv",
+            "--unit",
+            "m",
+            "-o",
+            tmp_path / "back.csv",
+        )
+        == 0
+    )
+    assert "\nCamera 1," in (tmp_path / "back.csv").read_text(encoding="utf-8")

@@ -47,6 +47,15 @@ def write_rows(cameras: Sequence[Camera], unit_m: float) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _words(line: str) -> list[str]:
+    """Return name and numbers of a line; a name may hold spaces where a comma ends it."""
+    name, _, rest = line.partition(";" if ";" in line else ",")
+    numbers = rest.replace(",", " ").replace(";", " ").split()
+    if len(numbers) in (12, 21):
+        return [name.strip(), *numbers]
+    return line.replace(",", " ").replace(";", " ").split()
+
+
 def read_rows(path: Path) -> ForeignRig:
     """Read lines ``name p11 ... p34`` or ``name K(9) R(9) t(3)``.
 
@@ -57,7 +66,7 @@ def read_rows(path: Path) -> ForeignRig:
     """
     cameras: list[ForeignCamera] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
-        words = line.replace(",", " ").replace(";", " ").split()
+        words = _words(line)
         if not words or words[0].startswith("#"):
             continue
         if len(words) == 1 and words[0].isdigit() and not cameras:
@@ -70,7 +79,13 @@ def read_rows(path: Path) -> ForeignRig:
             raise CalibrationError(
                 f"{path}, line {number}: not a name and numbers: {line.strip()[:60]!r}"
             ) from None
-        if len(numbers) not in (12, 21) or not np.isfinite(numbers).all():
+        if not np.isfinite(numbers).all():
+            which = int(np.flatnonzero(~np.isfinite(numbers))[0])
+            raise CalibrationError(
+                f"{path}, line {number}: number {which + 1} after the name {words[0]!r} is "
+                f"{words[1 + which]}; expected finite numbers"
+            )
+        if len(numbers) not in (12, 21):
             raise CalibrationError(
                 f"{path}, line {number}: {len(numbers)} numbers after the name {words[0]!r}, "
                 "expected 12 (a 3x4 matrix) or 21 (K, R and t)"

@@ -44,7 +44,7 @@ from hybridve.hull.cad.motion import Motion
 from hybridve.hull.cad.part import Part, Up
 from hybridve.hull.cad.readers import FORMATS, TESSELLATED, WITH_UNIT
 from hybridve.hull.cad.topology import Topology, meeting_faces
-from hybridve.hull.toml_io import expand_root, explain_validation, read_toml
+from hybridve.hull.toml_io import Name, expand_root, explain_validation, read_toml
 
 #: How many metres one unit of a mesh file is.
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -87,8 +87,7 @@ _MOTIONS = ("poses", "hinge", "track")
 
 
 class _ObjectTable(_Table):
-    # The name becomes a group of the report, where "/" separates and "." stands for the group.
-    name: Annotated[str, Field(pattern=r"^[^/\s.][^/\s]*$")]
+    name: Name
     mesh: str
     unit: Literal["m", "cm", "mm", "in", "ft"] | None = None
     up: Up | None = None

@@ -1,11 +1,9 @@
 """The tables of a session.toml, each key with what it may be."""
 
-import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -15,6 +13,7 @@ from pydantic import (
 
 from hybridve.calib.boards.markers import DICTIONARIES
 from hybridve.calib.camera import N_PARAMS
+from hybridve.hull.toml_io import Name
 
 #: What lengths of a rig calibrated elsewhere may be in; squares are those of the target.
 RigUnit = Literal["m", "cm", "mm", "in", "ft", "squares"]
@@ -22,18 +21,6 @@ RigUnit = Literal["m", "cm", "mm", "in", "ft", "squares"]
 #: How many degrees of freedom a lens has is found out from the pictures.
 AUTO_MODEL = "auto"
 
-
-def _is_name(name: str) -> str:
-    """Refuse what cannot be the name of a thing: it becomes that of a folder and of a group."""
-    if not re.fullmatch(r"[^/\\\"'\s]([^/\\\"'\x00-\x1f]*[^/\\\"'\s])?", name) or name[0] == ".":
-        raise ValueError(
-            f"found {name!r}; expected a name without / \\ and quotes, that begins with no dot and "
-            "neither begins nor ends with a space"
-        )
-    return name
-
-
-_Name = Annotated[str, AfterValidator(_is_name)]
 
 _Millimetres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -57,8 +44,8 @@ class TargetTable(_Table):
     """
 
     kind: str
-    name: _Name
-    body: _Name | None = None
+    name: Name
+    body: Name | None = None
     columns: Annotated[int, Field(ge=1)]
     rows: Annotated[int, Field(ge=1)]
 
@@ -200,7 +187,7 @@ class WorldPoint(_Table):
 class CameraTable(_Table):
     """A [[camera]] of a session."""
 
-    name: _Name
+    name: Name
     model: str = "OPENCV"
     intrinsics: str | None = None
     extrinsics: str | None = None

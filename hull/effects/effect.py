@@ -9,16 +9,17 @@ that give the same `make`.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from hybridve.calib.errors import SceneError
 from hybridve.hull.cad.scene import Scene, SceneObject
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.toml_io import Name
 
 #: How far a number can be trusted; see `hybridve.hull.report.result_file.Kind`.
 Trust = Literal["exact", "bound", "estimate", "sampled"]
@@ -41,8 +42,7 @@ class EffectTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: str
-    # It becomes a group of the file, where "/" separates and "." stands for the group.
-    name: Annotated[str, Field(pattern=r"^[^/\s.][^/\s]*$")] | None = None
+    name: Name | None = None
 
     @property
     def claimed(self) -> tuple[str, ...]:
