@@ -43,7 +43,7 @@ from hybridve.hull.effects.effect import (
     Told,
     UnstableError,
 )
-from hybridve.hull.jit import ZERO, compiled
+from hybridve.hull.jit import ZERO, compiled, inlined
 from hybridve.hull.query.frame import Frame
 from hybridve.hull.query.points import is_inside
 from hybridve.hull.query.segments import first_entry, first_exit, outward_normal, place_segment
@@ -233,7 +233,7 @@ class _Swarm:
         )
 
 
-@compiled
+@inlined
 def _flight(dt_s: float, rate: float) -> tuple[float, float, float]:
     """Return what dt_s leaves of a speed, and what a speed and an acceleration move meanwhile.
 
@@ -250,12 +250,12 @@ def _flight(dt_s: float, rate: float) -> tuple[float, float, float]:
     return 1.0 - lost, dt_s * by_speed, dt_s * dt_s * by_pull
 
 
-@compiled
+@inlined
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-@compiled
+@inlined
 def _slide(vector: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
     """Take from a vector what leads into the surface with an outward normal."""
     into = min(_dot(vector, normal), 0.0)
@@ -410,9 +410,7 @@ def _depth(
     least_m: float,
     room: NDArray[np.float64],
 ) -> float:
-    """Return the shortest of the ways out for a point, 0 outside of the hull; metres."""
-    if not _is_in(point, frame):
-        return 0.0
+    """Return the shortest of the ways out for a point that is in the hull, metres."""
     shortest = 1.0
     way = np.zeros(3)
     for number in range(len(ways)):
@@ -560,7 +558,8 @@ def _advance(
             n_rests += is_resting
             if n_rests == _MOST_RESTS:
                 break
-        depth_m[i] = max(depth_m[i], _depth(position, ways, frame, least_m, room))
+        if _is_in(position, frame):
+            depth_m[i] = max(depth_m[i], _depth(position, ways, frame, least_m, room))
 
 
 class _Source:
