@@ -6,7 +6,7 @@ share that the ball touches in a step is told). Light is that of a lamp 1.3 m ab
 m, a third of it dark. Proximity is that of a cube of as many triangles beside the ball, with zones
 and an exposure.
 
-Run: pytest tests/benchmarks/bench_effects_unmoved.py --full
+Run: pytest tests/benchmarks/bench_particles_light.py --full
 """
 
 from itertools import cycle
