@@ -304,7 +304,7 @@ class Simulation:
         values = {
             name: dict(columns)
             for effect, _ in self.effects
-            for name, columns in effect.values().items()
+            for name, columns in effect.values(frame.hull).items()
         }
         for (_, names), effect_s in zip(self.effects, seconds, strict=True):
             for name in names:

@@ -291,10 +291,15 @@ class Effect(Protocol):
         """
         ...
 
-    def values(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
+    def values(self, hull: Hull | None) -> Mapping[str, Mapping[str, NDArray[Any]]]:
         """Return by entry and column what stands at the end of a frame: `COMMON` and its own.
 
         What is counted "since the frame before" begins anew.
+
+        Parameters
+        ----------
+        hull : Hull or None
+            Of the frame; None if it has none, so that nothing went on.
         """
         ...
 
