@@ -1,0 +1,572 @@
+"""Rigid and hinged bodies: all of a scene in one MuJoCo world, so that they meet each other.
+
+What a step does, in its order:
+
+1. Bodies go on freely to where they would be at its end, and the hull is asked about them there
+   (`hybridve.hull.effects.hull_contacts`).
+2. Velocities are solved for in the middle of the step, all contacts at once
+   (`hybridve.hull.effects.body_solver`). A body that hit the hull is where it would be had it
+   turned at the surface, at the instant at which it crossed it: both flights are ballistic, and
+   what bounces fully keeps its energy however coarse the step.
+3. The hull is asked again, and what is still in it, in CAD or in another body is moved out, without
+   a velocity.
+
+Energy may come from the hull alone: its speed at contacts times their impulses, and the height that
+bodies are moved out to. Newton's restitution with friction can make some where many contacts meet;
+where it would, the step is solved without bouncing, and what were left is taken off the speed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from hybridve.hull.effects.body_model import (
+    BodyPlan,
+    World,
+    energies,
+    make_world,
+    places_of,
+    start_of,
+    twist_of,
+)
+from hybridve.hull.effects.body_shape import CollisionShape
+from hybridve.hull.effects.body_solver import (
+    SLOP_M,
+    HullRow,
+    Solved,
+    free_velocities,
+    least_impact,
+    moved,
+    own_depth,
+    solve_displacements,
+    solve_velocities,
+)
+from hybridve.hull.effects.effect import (
+    Drawn,
+    Instant,
+    Quantity,
+    Setting,
+    Told,
+    UnstableError,
+)
+from hybridve.hull.effects.hull_contacts import (
+    Arc,
+    HullContact,
+    Patch,
+    contact_of,
+    find_patches,
+)
+from hybridve.hull.query.bounds import boxes_are_free
+from hybridve.hull.query.clusters import spatial_order
+from hybridve.hull.query.engine import Triangles
+from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.viewport import read_only
+
+#: Bodies are moved out of what they are in at most so often a step.
+_MOST_MOVES = 3
+
+#: Faster than this, metres a second, nothing real is thrown.
+_MOST_SPEED = 1e4
+
+#: A step that makes more energy than this share of the kinetic is solved again; less is rounding.
+_MADE = 1e-4
+
+_POSE = Quantity(
+    "world_from_mesh",
+    "m",
+    "exact",
+    "rotation and place of the mesh, of the simulated state",
+    (3, 4),
+)
+
+#: The arrows of the paper's figure 5, of the deepest contact since the frame before.
+_ARROWS = (
+    Quantity(
+        "cp_obj_m",
+        "m",
+        "sampled",
+        "CP_obj of the deepest contact since the frame before; NaN where there was none",
+        (3,),
+        is_place=True,
+    ),
+    Quantity("cp_hull_m", "m", "estimate", "CP_hull of that contact", (3,), is_place=True),
+    Quantity("v_rec", "1", "estimate", "V_rec of that contact, a unit vector", (3,)),
+    Quantity("n_hull", "1", "estimate", "N_hull of that contact, a unit vector", (3,)),
+)
+
+RIGID_COLUMNS = (
+    Quantity("position_m", "m", "exact", "centre of mass", (3,), is_place=True),
+    Quantity(
+        "orientation_wxyz",
+        "1",
+        "exact",
+        "how it has turned since it stood as the scene has it: a unit quaternion",
+        (4,),
+    ),
+    Quantity("velocity_m_s", "m/s", "exact", "of the centre of mass", (3,)),
+    Quantity("angular_velocity_rad_s", "rad/s", "exact", "in the world's frame", (3,)),
+    _POSE,
+    *_ARROWS,
+)
+
+HINGE_COLUMNS = (
+    Quantity("angle_rad", "rad", "exact", "from its place in the scene, about its axis"),
+    Quantity("angular_velocity_rad_s", "rad/s", "exact", "about its axis"),
+    _POSE,
+    *_ARROWS,
+)
+
+
+@dataclass(slots=True, eq=False)
+class _Books:
+    """What is told of one body, since the start or since the frame before."""
+
+    hull_work_j: float = 0.0
+    penetration_m: float = 0.0
+    n_contacts: int = 0
+    deepest_m: float = 0.0
+    arrows: NDArray[np.float64] = field(default_factory=lambda: np.full((4, 3), np.nan))
+
+    def meet(self, contact: HullContact) -> None:
+        """Count a contact."""
+        self.n_contacts += len(contact.points_world)
+        if contact.out_m > self.deepest_m:
+            self.deepest_m = contact.out_m
+            start = contact.points_world[0]
+            end = start + contact.out_m * contact.v_rec
+            self.arrows = np.stack([start, end, contact.v_rec, contact.n_hull])
+
+    def begin_frame(self) -> None:
+        """Count anew what is counted since the frame before."""
+        self.penetration_m, self.n_contacts, self.deepest_m = 0.0, 0, 0.0
+        self.arrows = np.full((4, 3), np.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """What of a body the hull is asked about: its mesh, and how large it is.
+
+    The vertices are in the frame of the body, the radius about its centre of mass.
+    """
+
+    triangles: Triangles
+    vertices_body: NDArray[np.float64]
+    radius_m: float
+    size_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hit:
+    """A row of the solve, with the speed of the hull along its normal."""
+
+    row: HullRow
+    hull_m_s: float
+
+
+class Bodies:
+    """All rigid and hinged bodies of a scene; see `hybridve.hull.effects.effect.Effect`."""
+
+    told: Mapping[str, Told]
+
+    def __init__(self, plans: Sequence[BodyPlan], setting: Setting) -> None:
+        self._engine = setting.engine
+        self._world = make_world(plans, setting.obstacles, setting.views.origin_world)
+        self._data = mujoco.MjData(self._world.model)
+        self._surfaces = [_surface_of(plan, setting.viewport) for plan in plans]
+        self._scene_places = places_of(self._world, self._world.model.qpos0)
+        self._positions, self._velocities = start_of(self._world)
+        self._potential_at_start_j = self._energies()[1]
+        self._books = [_Books() for _ in plans]
+        self.told = {plan.name: _told_of(self._world, plan) for plan in plans}
+
+    def advance(self, instant: Instant, step_s: float) -> None:
+        """Go on by one step, to be out of the hull of this instant at its end."""
+        world, data = self._world, self._data
+        self._damp(step_s)
+        before_j = float(np.sum(self._energies()))
+        middle = moved(world, self._positions, self._velocities, 0.5 * step_s)
+        free = free_velocities(world, data, middle, self._velocities, step_s)
+        self._check(free)
+        ahead = moved(world, middle, free, 0.5 * step_s)
+        contacts = [
+            (body, contact)
+            for body, patches in self._patches(instant.hull, ahead)
+            for contact in self._contacts_of(instant, body, patches)
+        ]
+        n_own = data.ncon
+        hits, times = self._impacts(contacts, middle, ahead, free, step_s)
+        for bounces in (True, False):
+            if not bounces:
+                hits = [replace(hit, row=replace(hit.row, after_m_s=hit.hull_m_s)) for hit in hits]
+                times = np.full_like(times, 0.5 * step_s)
+            solved = solve_velocities(
+                world,
+                data,
+                self._velocities,
+                [hit.row for hit in hits],
+                step_s,
+                n_own=n_own,
+                bounces=bounces,
+            )
+            ended = moved(world, ahead, times * (solved.change - free), 1.0)
+            work_j = solved.hull_impulse * [hit.hull_m_s for hit in hits]
+            kinetic, potential = energies(world, places_of(world, ended), solved.change)
+            made_j = float(kinetic.sum() + potential.sum() - work_j.sum()) - before_j
+            if not solved.meets or made_j <= _MADE * float(kinetic.sum()):
+                break
+        if solved.meets and made_j > 0:
+            solved = replace(solved, change=self._slowed(solved.change, free, made_j))
+        self._positions, self._velocities = ended, solved.change
+        for hit, joules in zip(hits, work_j.tolist(), strict=True):
+            self._books[hit.row.body].hull_work_j += joules
+        for body, contact in contacts:
+            self._books[body].meet(contact)
+        self._check(self._velocities)
+        self._move_out(instant.hull, near_hull=bool(contacts))
+
+    def values(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
+        """Return by entry and column what stands at the end of a frame; counts begin anew."""
+        kinetic, potential = self._energies()
+        potential = potential - self._potential_at_start_j
+        found: dict[str, Mapping[str, NDArray[Any]]] = {}
+        for body, (plan, books) in enumerate(zip(self._world.plans, self._books, strict=True)):
+            found[plan.name] = {
+                "kinetic_j": np.asarray(kinetic[body]),
+                "potential_j": np.asarray(potential[body]),
+                "hull_work_j": np.asarray(books.hull_work_j),
+                "penetration_m": np.asarray(books.penetration_m),
+                "n_contacts": np.asarray(books.n_contacts, np.uint32),
+                **self._pose_of(body),
+                **dict(
+                    zip(("cp_obj_m", "cp_hull_m", "v_rec", "n_hull"), books.arrows, strict=True)
+                ),
+            }
+            books.begin_frame()
+        return found
+
+    def state(self) -> Mapping[str, NDArray[Any]]:
+        """Return all that decides how it goes on, as arrays."""
+        return {
+            "positions": self._positions.copy(),
+            "velocities": self._velocities.copy(),
+            "hull_work_j": np.array([books.hull_work_j for books in self._books]),
+            "penetration_m": np.array([books.penetration_m for books in self._books]),
+            "n_contacts": np.array([books.n_contacts for books in self._books], np.int64),
+            "deepest_m": np.array([books.deepest_m for books in self._books]),
+            "arrows": np.array([books.arrows for books in self._books]),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what `state` gave, to the same values to the bit."""
+        self._positions = np.array(state["positions"], np.float64)
+        self._velocities = np.array(state["velocities"], np.float64)
+        self._books = [
+            _Books(float(work_j), float(penetration_m), int(count), float(deepest_m), arrows.copy())
+            for work_j, penetration_m, count, deepest_m, arrows in zip(
+                state["hull_work_j"],
+                state["penetration_m"],
+                state["n_contacts"],
+                state["deepest_m"],
+                state["arrows"],
+                strict=True,
+            )
+        ]
+
+    def _energies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        places = places_of(self._world, self._positions)
+        return energies(self._world, places, self._velocities)
+
+    def _damp(self, step_s: float) -> None:
+        """Let viscous friction in the hinges act, exactly, whatever the step."""
+        for plan, dof in zip(self._world.plans, self._world.dof_at.tolist(), strict=True):
+            if plan.hinge is not None and plan.hinge.damping_n_m_s > 0:
+                rate = plan.hinge.damping_n_m_s / self._world.mass_diagonal[dof]
+                self._velocities[dof] *= np.exp(-rate * step_s)
+
+    def _slowed(
+        self, velocities: NDArray[np.float64], free: NDArray[np.float64], made_j: float
+    ) -> NDArray[np.float64]:
+        """Return velocities (nv,) of so much less energy, of what met something."""
+        met = velocities != free
+        kinetic_j = float((0.5 * self._world.mass_diagonal * velocities**2)[met].sum())
+        left = max(0.0, 1.0 - made_j / kinetic_j) if kinetic_j > 0 else 1.0
+        return np.where(met, velocities * left**0.5, velocities)
+
+    def _check(self, velocities: NDArray[np.float64]) -> None:
+        # What is not a number is not below a limit either.
+        is_sane = np.abs(velocities) < _MOST_SPEED
+        if is_sane.all():
+            return
+        dof = int(is_sane.argmin())
+        body = int(np.searchsorted(self._world.dof_at, dof, side="right")) - 1
+        raise UnstableError(
+            f"{self._world.plans[body].name}: a velocity of {velocities[dof]:g} m/s or rad/s, "
+            f"expected one below {_MOST_SPEED:g}"
+        )
+
+    def _mesh(
+        self, body: int, center_local: NDArray[np.float64], rotation: NDArray[np.float64]
+    ) -> Triangles:
+        surface = self._surfaces[body]
+        center_world = center_local + self._world.origin_world
+        return surface.triangles.moved(surface.vertices_body @ rotation.T + center_world)
+
+    def _patches(self, hull: Hull, positions: NDArray[np.float64]) -> list[tuple[int, list[Patch]]]:
+        """Return the bodies that the hull meets at positions (nq,), with their contacts."""
+        world = self._world
+        places = places_of(world, positions)
+        centers = places.center_local + world.origin_world
+        radii = np.array([surface.radius_m for surface in self._surfaces])[:, None]
+        near = np.flatnonzero(~boxes_are_free(hull, centers - radii, centers + radii)).tolist()
+        meshes = [
+            self._mesh(body, places.center_local[body], places.rotation[body]) for body in near
+        ]
+        if not meshes:
+            return []
+        found = []
+        for body, mesh, hits in zip(near, meshes, self._engine.query(hull, meshes), strict=True):
+            plan = world.plans[body]
+            patches = find_patches(
+                hull,
+                mesh,
+                hits,
+                center_world=centers[body],
+                is_closed=plan.scene_object.is_closed,
+                arc=None if plan.hinge is None else Arc(plan.hinge.axis, plan.hinge.anchor_world),
+            )
+            if patches:
+                found.append((body, patches))
+        return found
+
+    def _contacts_of(
+        self, instant: Instant, body: int, patches: Sequence[Patch]
+    ) -> list[HullContact]:
+        size_m = self._surfaces[body].size_m
+        found = (
+            contact_of(
+                instant.hull,
+                patch,
+                size_m=size_m,
+                before=instant.before,
+                elapsed_s=instant.elapsed_s,
+            )
+            for patch in patches
+        )
+        return [contact for contact in found if contact is not None]
+
+    def _impacts(
+        self,
+        contacts: Sequence[tuple[int, HullContact]],
+        middle: NDArray[np.float64],
+        ahead: NDArray[np.float64],
+        free: NDArray[np.float64],
+        step_s: float,
+    ) -> tuple[list[_Hit], NDArray[np.float64]]:
+        """Return what contacts with the hull ask of velocities, and since when bodies have changed.
+
+        A velocity that the solve gives to a body acts on its place for half a step, as the midpoint
+        rule has it; of one that hit the hull, for as long as it has been in it.
+
+        Parameters
+        ----------
+        contacts : sequence of (int, HullContact)
+            Bodies and what they met `ahead`.
+        middle, ahead : (nq,) float64
+            Positions in the middle and at the end of the step, of bodies that met nothing.
+        free : (nv,) float64
+            Their velocities at its end.
+        step_s : float
+            Seconds.
+
+        Returns
+        -------
+        hits : list of _Hit
+        times : (nv,) float64
+            Seconds.
+        """
+        world = self._world
+        times = np.full(world.model.nv, 0.5 * step_s)
+        if not contacts:
+            return [], times
+        gained = (free - self._velocities) / step_s
+        there, here = places_of(world, ahead), places_of(world, middle)
+        hits = []
+        for body in sorted({body for body, _ in contacts}):
+            own = [contact for other, contact in contacts if other == body]
+            points_world = np.concatenate([contact.points_world for contact in own])
+            counts = [len(contact.points_world) for contact in own]
+            normals = np.repeat([contact.n_hull for contact in own], counts, axis=0)
+            hull_m_s = np.repeat([contact.speed_m_s for contact in own], counts)
+            depths_m = np.concatenate([contact.depths_m for contact in own])
+            arms = points_world - world.origin_world - there.center_local[body]
+            approach, pull = (
+                ((linear + np.cross(angular, arms)) * normals).sum(axis=1)
+                for linear, angular in (
+                    twist_of(world, there, rates, body) for rates in (free, gained)
+                )
+            )
+            approach -= hull_m_s
+            # Since when it is that deep: depth = -approach t + pull t^2 / 2.
+            root = np.sqrt(np.maximum(approach**2 + 2.0 * pull * depths_m, 0.0))
+            since_s = np.clip(2.0 * depths_m / np.maximum(root - approach, 1e-12), 0.0, step_s)
+            is_impact = approach - pull * since_s < -least_impact(step_s)
+            leaves = np.zeros(len(arms))
+            if is_impact.any():
+                # All points of a body are taken at the instant of its first touch.
+                first_s = since_s[np.where(is_impact, depths_m, -1.0).argmax()]
+                at_touch = approach - pull * first_s
+                bounces = at_touch < -least_impact(step_s)
+                leaves[bounces] = -world.plans[body].restitution * at_touch[bounces]
+                leaves[bounces] += pull[bounces] * first_s  # it has flown on since
+                at = int(world.dof_at[body])
+                times[at : at + (6 if world.is_free[body] else 1)] = first_s
+            turn = here.rotation[body] @ there.rotation[body].T
+            points_local = here.center_local[body] + arms @ turn.T
+            hits += [
+                _Hit(HullRow(body, *row), float(speed))
+                for *row, speed in zip(
+                    points_local, normals, depths_m, leaves + hull_m_s, hull_m_s, strict=True
+                )
+            ]
+        return hits, times
+
+    def _move_out(self, hull: Hull, *, near_hull: bool) -> None:
+        """Move bodies out of the hull, of CAD and of each other, and tell how deep they stay."""
+        world, data = self._world, self._data
+        patches = self._patches(hull, self._positions) if near_hull else []
+        for _ in range(_MOST_MOVES):
+            own_m = own_depth(world, data, self._positions)
+            rows = self._rows_out(hull, patches)
+            if own_m <= 0 and all(row.depth_m <= 1.01 * SLOP_M for row in rows):
+                break
+            solved = solve_displacements(world, data, rows)
+            before = self._energies()[1]
+            self._positions = moved(world, self._positions, solved.change, 1.0)
+            rose_j = self._energies()[1] - before
+            for body in self._pushed(rows, solved).tolist():
+                self._books[body].hull_work_j += rose_j[body]
+            if near_hull:
+                patches = self._patches(hull, self._positions)
+        for body, found in patches:
+            books = self._books[body]
+            for patch in found:
+                out_m = float(patch.out_m.max())
+                books.penetration_m = max(books.penetration_m, out_m)
+
+    def _rows_out(self, hull: Hull, patches: Sequence[tuple[int, list[Patch]]]) -> list[HullRow]:
+        rows = []
+        for body, found in patches:
+            for patch in found:
+                contact = contact_of(hull, patch, size_m=self._surfaces[body].size_m)
+                if contact is not None:
+                    points_local = contact.points_world - self._world.origin_world
+                    rows += [
+                        HullRow(body, point, contact.n_hull, depth_m)
+                        for point, depth_m in zip(
+                            points_local, contact.depths_m.tolist(), strict=True
+                        )
+                    ]
+        return rows
+
+    def _pushed(self, rows: Sequence[HullRow], solved: Solved) -> NDArray[np.int64]:
+        """Return the bodies that the hull moved, itself or through others."""
+        world = self._world
+        n_bodies = world.model.nbody
+        moves = np.zeros(n_bodies, np.bool_)
+        moves[world.body_id] = True
+        joined = solved.joined[moves[solved.joined].all(axis=1)]
+        graph = coo_array(
+            (np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=(n_bodies, n_bodies)
+        )
+        label = connected_components(graph, directed=False)[1]
+        touched = label[world.body_id[[row.body for row in rows]]]
+        return np.flatnonzero(np.isin(label[world.body_id], touched))
+
+    def _pose_of(self, body: int) -> dict[str, NDArray[Any]]:
+        world = self._world
+        plan, places = world.plans[body], places_of(world, self._positions)
+        rotation = places.rotation[body] @ self._scene_places.rotation[body].T
+        center_world = places.center_local[body] + world.origin_world
+        shift = center_world - rotation @ plan.share.center
+        mesh = plan.scene_object.world_from_mesh
+        pose = np.column_stack([rotation @ mesh[:, :3], rotation @ mesh[:, 3] + shift])
+        dof = int(world.dof_at[body])
+        if plan.hinge is not None:
+            return {
+                "angle_rad": np.asarray(self._positions[world.qpos_at[body]]),
+                "angular_velocity_rad_s": np.asarray(self._velocities[dof]),
+                "world_from_mesh": pose,
+            }
+        orientation = np.zeros(4)
+        mujoco.mju_mat2Quat(orientation, np.ascontiguousarray(rotation).ravel())
+        linear, angular = twist_of(world, places, self._velocities, body)
+        return {
+            "position_m": center_world,
+            "orientation_wxyz": orientation,
+            "velocity_m_s": linear.copy(),
+            "angular_velocity_rad_s": angular,
+            "world_from_mesh": pose,
+        }
+
+
+def _surface_of(plan: BodyPlan, viewport: int) -> _Surface:
+    vertices_world = plan.scene_object.vertices_world
+    faces = plan.faces[spatial_order(vertices_world, plan.faces)]
+    used = vertices_world[faces.ravel()]
+    return _Surface(
+        Triangles(
+            vertices_world, read_only(faces), read_only(np.full(len(faces), viewport, np.int32))
+        ),
+        (vertices_world - plan.share.center) @ plan.share.axes,
+        float(np.linalg.norm(used - plan.share.center, axis=1).max()),
+        float(np.linalg.norm(np.ptp(used, axis=0))),
+    )
+
+
+def _told_of(world: World, plan: BodyPlan) -> Told:
+    scene_object, share = plan.scene_object, plan.share
+    shape = world.shapes[scene_object.name]
+    is_closed = scene_object.is_closed
+    about = {
+        "object": scene_object.name,
+        "mass_kg": plan.mass_kg,
+        "mass_lies_in": "its volume" if is_closed else "its area, for its surface is open",
+        "volume_m3": abs(share.volume_m3) if is_closed else None,
+        "center_of_mass_m": share.center.tolist(),
+        "moments_of_inertia_kg_m2": (plan.mass_kg * share.inertia_m2).tolist(),
+        "collides_with_the_hull_as": "its mesh",
+        "collides_with_bodies_and_cad_as": _shape_in_words(shape),
+        "outside_its_mesh_by_at_most_m": shape.outside_m,
+        "cad_collides_as": {
+            name: _shape_in_words(one)
+            for name, one in world.shapes.items()
+            if name not in {other.scene_object.name for other in world.plans}
+        },
+        "friction_along_the_hull": "as if its surface stood: silhouettes do not show it slide",
+        "does_not_meet": [other for name, other in world.unmet if name == plan.name],
+    }
+    mesh = scene_object.vertices_mesh
+    return Told(
+        columns=RIGID_COLUMNS if plan.hinge is None else HINGE_COLUMNS,
+        drawn=Drawn(
+            "world_from_mesh",
+            scene_object.vertices_world if mesh is None else mesh,
+            scene_object.faces,
+        ),
+        about=about,
+    )
+
+
+def _shape_in_words(shape: CollisionShape) -> str:
+    words = []
+    if shape.n_convex:
+        words.append(f"{shape.n_convex} convex part{'s' if shape.n_convex > 1 else ''} of its mesh")
+    if shape.n_prisms:
+        words.append(f"{shape.n_prisms} triangles {1000 * shape.prism_m:.1f} mm thick")
+    return " and ".join(words)

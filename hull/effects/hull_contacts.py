@@ -1,0 +1,406 @@
+"""Where the hull meets a body, which way out, how deep, and how fast the hull comes.
+
+Collision points that lie near each other are a patch; two hands that squeeze a ball are two. Its
+recovery vector V_rec points against the mean outward normal of the body's surface over the patch
+(for a hinge along its arc), for a body's centre tells nothing where it is long or hollow. Where the
+surface is open, both ways are tried, and the shorter is taken. From collision points along V_rec,
+the exits of `hybridve.hull.query.walk` are CP_hull.
+
+N_hull is that of a plane through exits around CP_hull. A silhouette's rim is a staircase of pixels:
+the normal of one silhouette there is off by a degree in the mean, while the exits of a footprint as
+large as the body average it out, and see the hull as the body does, across creases.
+
+How fast the hull moves is what the same rays say of an earlier hull.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from hybridve.hull.query.engine import Hits, Triangles
+from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.query.viewport import sample_positions
+from hybridve.hull.query.walk import spans_of_rays
+
+#: Collision points that are grouped, and those of a patch whose way out is measured, at most.
+_MOST_POINTS, _MOST_RAYS = 400, 24
+
+#: Contacts of a patch at most: a face needs its corners.
+MOST_CONTACTS = 6
+
+#: A mean normal shorter than this has no direction: the patch goes all around.
+_LEAST_MEAN = 0.1
+
+#: A normal that leans more than this against V_rec (as a cosine) is not believed.
+_LEAST_COSINE = 0.2
+
+#: The footprint of a normal: a share of the body's size, and pixels at least.
+_FOOTPRINT_SHARE, _FOOTPRINT_PX = 0.2, 4.0
+
+#: The fastest that a hull is followed, metres a second.
+MOST_HULL_SPEED = 10.0
+
+#: Rays around CP_hull, as shares of the footprint's radius: two rings and the middle.
+_RING = np.arange(8) * (np.pi / 4)
+_OFFSETS = np.concatenate(
+    [
+        np.zeros((1, 2)),
+        np.column_stack([np.cos(_RING), np.sin(_RING)]) * 0.5,
+        np.column_stack([np.cos(_RING + np.pi / 8), np.sin(_RING + np.pi / 8)]),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arc:
+    """The way that a hinged body can go.
+
+    Attributes
+    ----------
+    axis : (3,) float64
+        Unit vector, world.
+    anchor_world : (3,) float64
+        A point of it, metres.
+    """
+
+    axis: NDArray[np.float64]
+    anchor_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """One connected contact of a body and the hull.
+
+    Attributes
+    ----------
+    points_world : (K, 3) float64
+        Collision points, metres, the deepest first.
+    out_m : (K,) float64
+        How far each is from its exit along V_rec; infinite where none is within reach.
+    v_rec : (3,) float64
+        The recovery vector.
+    """
+
+    points_world: NDArray[np.float64]
+    out_m: NDArray[np.float64]
+    v_rec: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HullContact:
+    """A patch as the solver takes it.
+
+    Attributes
+    ----------
+    points_world : (K, 3) float64
+        At most `MOST_CONTACTS` points of the body in the hull, metres, the deepest first.
+    depths_m : (K,) float64
+        How deep they are, along `n_hull`.
+    n_hull : (3,) float64
+        N_hull, outwards.
+    speed_m_s : float
+        How fast the hull's surface moves along it.
+    v_rec : (3,) float64
+        The patch's recovery vector.
+    out_m : float
+        D_rec of the first point.
+    """
+
+    points_world: NDArray[np.float64]
+    depths_m: NDArray[np.float64]
+    n_hull: NDArray[np.float64]
+    speed_m_s: float
+    v_rec: NDArray[np.float64]
+    out_m: float
+
+
+def find_patches(
+    hull: Hull,
+    mesh: Triangles,
+    hits: Hits,
+    *,
+    center_world: NDArray[np.float64],
+    is_closed: bool,
+    arc: Arc | None = None,
+) -> list[Patch]:
+    """Return the connected contacts of one body, those that leave against their entry left out.
+
+    Parameters
+    ----------
+    hull : Hull
+        The visual hull.
+    mesh : Triangles
+        The body where it is; of a closed one all faces outwards.
+    hits : Hits
+        Its samples in the hull.
+    center_world : (3,) float64
+        RP_obj: where a patch gives way to that goes all around the body.
+    is_closed : bool
+        Whether the faces tell inside and outside apart.
+    arc : Arc or None
+        Of a hinged body.
+    """
+    if len(hits.start) == 0:
+        return []
+    size_m = float(np.linalg.norm(np.ptp(mesh.vertices_world, axis=0)))
+    reach_m = max(2.0 * size_m, 0.1)
+    triangle, sample = hits.thinned(_MOST_POINTS)
+    corners = mesh.corners_world[triangle]
+    points_world = sample_positions(corners, mesh.viewports[triangle], sample.astype(np.uint32))
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    viewports = mesh.viewports[triangle].astype(np.float64)
+    weighted = across / (viewports * (viewports + 1.0))[:, None]  # a sample's share of the area
+    edges_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    spacing_m = float((edges_m / np.maximum(viewports - 1.0, 1.0)).max())
+    thinning = max(1.0, len(hits) / len(points_world))
+    label = _clusters(points_world, 1.7 * spacing_m * thinning**0.5)
+    patches = []
+    for number in range(int(label.max()) + 1):
+        is_here = label == number
+        patches.append(
+            _patch(
+                hull,
+                points_world[is_here],
+                weighted[is_here],
+                center_world,
+                is_closed,
+                arc,
+                reach_m,
+            )
+        )
+    return _without_pierced(patches)
+
+
+def _clusters(points_world: NDArray[np.float64], near_m: float) -> NDArray[np.int32]:
+    """Return a number for each point, the same for those that steps of `near_m` join."""
+    n_points = len(points_world)
+    if np.ptp(points_world, axis=0).max() <= near_m:
+        return np.zeros(n_points, np.int32)
+    pairs = cKDTree(points_world).query_pairs(near_m, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_points, n_points))
+    label: NDArray[np.int32] = connected_components(graph, directed=False)[1]
+    return label
+
+
+def _patch(
+    hull: Hull,
+    points_world: NDArray[np.float64],
+    weighted: NDArray[np.float64],
+    center_world: NDArray[np.float64],
+    is_closed: bool,
+    arc: Arc | None,
+    reach_m: float,
+) -> Patch:
+    weights = np.linalg.norm(weighted, axis=1)
+    total = max(float(weights.sum()), float(np.finfo(np.float64).tiny))
+    mean = weighted.sum(axis=0) / total
+    middle = weights @ points_world / total if weights.any() else points_world.mean(axis=0)
+    if not is_closed:  # one face's normal, the others turned to its side
+        turned = weighted * np.where(weighted @ weighted[weights.argmax()] < 0, -1.0, 1.0)[:, None]
+        mean = turned.sum(axis=0) / total
+    v_rec = -mean
+    if np.linalg.norm(mean) < _LEAST_MEAN:
+        farthest = points_world[((points_world - center_world) ** 2).sum(axis=1).argmax()]
+        v_rec = center_world - farthest
+    if arc is not None:
+        tangent = np.cross(arc.axis, middle - arc.anchor_world)
+        v_rec = tangent if tangent @ v_rec >= 0 else -tangent
+    length = float(np.linalg.norm(v_rec))
+    v_rec = v_rec / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    chosen = points_world[_spread(points_world, _MOST_RAYS)]
+    found = _ways_out(hull, chosen, v_rec, reach_m)
+    if not is_closed:
+        other = _ways_out(hull, chosen, -v_rec, reach_m)
+        if other.max() < found.max():
+            v_rec, found = -v_rec, other
+    order = np.argsort(-np.where(np.isfinite(found), found, -1.0), kind="stable")
+    return Patch(chosen[order], found[order], v_rec)
+
+
+def _spread(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Return the numbers of points that lie far from each other: each farthest from those before.
+
+    The first is the one farthest from their mean.
+    """
+    if len(points) <= most:
+        return np.arange(len(points))
+    apart = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
+    chosen = [int(apart.argmax())]
+    apart = ((points - points[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < most:
+        chosen.append(int(apart.argmax()))
+        apart = np.minimum(apart, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+    return np.array(chosen)
+
+
+def _ways_out(
+    hull: Hull, points_world: NDArray[np.float64], v_rec: NDArray[np.float64], reach_m: float
+) -> NDArray[np.float64]:
+    """Return how far points are from where they leave the hull: 0 outside, infinite if nowhere."""
+    directions = np.broadcast_to(v_rec, points_world.shape)
+    found = np.zeros(len(points_world))
+    for i, spans_m in enumerate(spans_of_rays(hull, points_world, directions, reach_m)):
+        if len(spans_m) and spans_m[0, 0] == 0.0:
+            found[i] = spans_m[0, 1] if spans_m[0, 1] < reach_m else np.inf
+    return found
+
+
+def _without_pierced(patches: list[Patch]) -> list[Patch]:
+    """Leave out patches where a piece of the hull that entered elsewhere comes out of the body.
+
+    Its way out leads back through the body, against that of the patch where it entered, which is
+    the shorter. Two hands that squeeze a body are apart from each other within it.
+    """
+    kept = []
+    for patch in patches:
+        for other in patches:
+            ahead_m = (patch.points_world[0] - other.points_world[0]) @ other.v_rec
+            is_behind = other.v_rec @ patch.v_rec < -0.3 and 0 < ahead_m <= other.out_m[0]
+            if is_behind and other.out_m[0] < patch.out_m[0]:
+                break
+        else:
+            kept.append(patch)
+    return kept
+
+
+def contact_of(
+    hull: Hull,
+    patch: Patch,
+    *,
+    size_m: float,
+    before: Hull | None = None,
+    elapsed_s: float = 0.0,
+) -> HullContact | None:
+    """Return a patch as the solver takes it; None if no point of it has a way out.
+
+    Parameters
+    ----------
+    hull : Hull
+        The visual hull.
+    patch : Patch
+        A contact with it.
+    size_m : float
+        The body's size: the diagonal of its bounding box.
+    before : Hull or None
+        An earlier hull; None if nothing is known of how fast it moves.
+    elapsed_s : float
+        How much earlier, seconds.
+    """
+    has_exit = np.isfinite(patch.out_m) & (patch.out_m > 0)
+    if not has_exit.any():
+        return None
+    points_world, out_m = patch.points_world[has_exit], patch.out_m[has_exit]
+    n_hull, speed = _surface(
+        hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, before, elapsed_s
+    )
+    cosine = float(n_hull @ patch.v_rec)
+    chosen = _deepest_and_spread(points_world)
+    return HullContact(
+        points_world[chosen],
+        out_m[chosen] * cosine,
+        n_hull,
+        speed * cosine,
+        patch.v_rec,
+        float(out_m[0]),
+    )
+
+
+def _deepest_and_spread(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the first and those that lie far from it and from each other."""
+    chosen = [0]
+    apart = ((points - points[0]) ** 2).sum(axis=1)
+    while len(chosen) < MOST_CONTACTS and apart.max() > 0:
+        chosen.append(int(apart.argmax()))
+        apart = np.minimum(apart, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+    return np.array(chosen)
+
+
+def _surface(
+    hull: Hull,
+    point_world: NDArray[np.float64],
+    out_m: float,
+    v_rec: NDArray[np.float64],
+    size_m: float,
+    before: Hull | None,
+    elapsed_s: float,
+) -> tuple[NDArray[np.float64], float]:
+    """Return the normal of the hull where a point leaves it, and its speed along V_rec."""
+    pixel_m = pixel_size(hull.views, point_world)
+    radius_m = max(_FOOTPRINT_SHARE * size_m, _FOOTPRINT_PX * pixel_m)
+    side = np.cross(v_rec, np.eye(3)[np.abs(v_rec).argmin()])
+    side /= np.linalg.norm(side)
+    frame = np.stack([side, np.cross(v_rec, side)])  # (2, 3)
+    moves = before is not None and before is not hull and elapsed_s > 0
+    back_m = 2.0 * radius_m + (MOST_HULL_SPEED * elapsed_s if moves else 0.0)
+    origins = point_world - back_m * v_rec + radius_m * _OFFSETS @ frame
+    middle_m = back_m + out_m
+    reach_m = middle_m + back_m
+    here_m = _ends_near(hull, origins, v_rec, np.full(len(origins), middle_m), reach_m)
+    is_near = np.abs(here_m - middle_m) <= 1.5 * radius_m
+    n_hull = _plane_normal(radius_m * _OFFSETS[is_near] @ frame, here_m[is_near], v_rec)
+    speed = 0.0
+    if moves and before is not None:
+        then_m = _ends_near(before, origins, v_rec, here_m, reach_m)
+        both = is_near & np.isfinite(then_m)
+        if 2 * both.sum() >= is_near.sum() > 0:
+            speed = float((here_m - then_m)[both].mean()) / elapsed_s
+    return n_hull, float(np.clip(speed, -MOST_HULL_SPEED, MOST_HULL_SPEED))
+
+
+def pixel_size(views: Views, point_world: NDArray[np.float64]) -> float:
+    """Return how large a pixel is at a point, metres: in the mean of the cameras before it."""
+    matrices = views.img_from_local
+    depths_m = matrices[:, 2, :3] @ (point_world - views.origin_world) + matrices[:, 2, 3]
+    focal_px = np.linalg.norm(np.cross(matrices[:, 0, :3], matrices[:, 2, :3]), axis=1)
+    in_front = depths_m > 0
+    return float((depths_m / focal_px)[in_front].mean()) if in_front.any() else 0.0
+
+
+def _ends_near(
+    hull: Hull,
+    origins: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    wanted_m: NDArray[np.float64],
+    reach_m: float,
+) -> NDArray[np.float64]:
+    """Return where rays leave the hull, nearest to what is wanted; infinite if nowhere."""
+    ends_m = np.full(len(origins), np.inf)
+    directions = np.broadcast_to(direction, origins.shape)
+    for i, spans_m in enumerate(spans_of_rays(hull, origins, directions, reach_m)):
+        ends = spans_m[spans_m[:, 1] < reach_m, 1]
+        if len(ends) and np.isfinite(wanted_m[i]):
+            ends_m[i] = ends[np.abs(ends - wanted_m[i]).argmin()]
+    return ends_m
+
+
+def _plane_normal(
+    beside: NDArray[np.float64], ahead_m: NDArray[np.float64], v_rec: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the normal of the plane through points `beside` (K, 3) + `ahead_m` V_rec.
+
+    Those that lie far from it are left out once: beyond an edge the hull is another surface. V_rec
+    where they span no plane, or one that leans too far.
+    """
+    kept = np.ones(len(beside), np.bool_)
+    normal = v_rec
+    for _ in range(2):
+        if kept.sum() < 4:
+            return v_rec
+        from_middle = beside[kept] - beside[kept].mean(axis=0)
+        spread, axes = np.linalg.eigh(from_middle.T @ from_middle)
+        if spread[1] < 0.05 * spread[2]:  # spread[0] is along V_rec: they lie on a line
+            return v_rec
+        slopes = (axes[:, 1:].T @ (from_middle.T @ ahead_m[kept])) / spread[1:]
+        tilt = axes[:, 1:] @ slopes
+        normal = v_rec - tilt
+        off_m = ahead_m - ahead_m[kept].mean() - (beside - beside[kept].mean(axis=0)) @ tilt
+        limit_m = 2.0 * float(np.sqrt(np.mean(off_m[kept] ** 2))) + 1e-9
+        if (np.abs(off_m) <= limit_m).sum() == kept.sum():
+            break
+        kept = np.abs(off_m) <= limit_m
+    normal = normal / np.linalg.norm(normal)
+    return np.asarray(normal if normal @ v_rec >= _LEAST_COSINE else v_rec)
