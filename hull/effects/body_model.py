@@ -21,6 +21,10 @@ from hybridve.hull.effects.effect import GRAVITY_M_S2
 #: makes them harder still.
 _HARD = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
+#: Bodies this near to each other are asked not to come nearer than touching, metres: what is stacked
+#: without a gap stays where it is.
+_NEAR_M = 1e-4
+
 #: What collides is at most in so many pieces: more take minutes to prepare.
 _MOST_PIECES = 30_000
 
@@ -239,6 +243,7 @@ def _add_pieces(
             condim=3 if friction > 0 else 1,
             friction=[friction, 0.0, 0.0],
             solimp=_HARD,
+            margin=_NEAR_M,
         )
 
 

@@ -32,7 +32,14 @@ from hybridve.hull.effects.body_model import World
 from hybridve.hull.effects.effect import GRAVITY_M_S2
 
 #: What remains of MuJoCo's softness. A tonne on a gram sinks by less than a micrometre a second.
-_SOFT = 1e-6
+_SOFT = 1e-8
+
+#: The same of displacements, of which a hundredth may be left: of two hands that are not quite
+#: parallel, the way out is far to the side, and no body takes it.
+_SOFT_MOVES = 100.0
+
+#: Bodies are displaced at most by so many times the deepest depth.
+_MOST_MOVE = 3.0
 
 #: Solves for friction: until slip is known to so many metres a second, at most so often.
 _SLIP_TOLERANCE, _MOST_SOLVES = 1e-5, 12
@@ -90,12 +97,15 @@ class Solved:
         MuJoCo's bodies that met each other.
     meets : bool
         Whether anything met anything, stops included.
+    missed_m_s : float
+        By how much something moves farther into the hull than it was to, at most.
     """
 
     change: NDArray[np.float64]
     hull_impulse: NDArray[np.float64]
     joined: NDArray[np.int64]
     meets: bool
+    missed_m_s: float = 0.0
 
 
 def least_impact(step_s: float) -> float:
@@ -185,7 +195,7 @@ def solve_velocities(
     """
     model = world.model
     data.ncon = n_own
-    _constrain(world, data, rows)
+    _constrain(world, data, rows, _SOFT)
     if data.nefc == 0:
         free = np.asarray(velocities + step_s * data.qacc_smooth)
         return Solved(free, np.zeros(len(rows)), np.zeros((0, 2), np.int64), False)
@@ -200,10 +210,13 @@ def solve_velocities(
         restitution = world.restitution[model.jnt_bodyid[joint]]
         # Of a stop, the approach is an angular velocity; at 1 m it is as large as a velocity.
         after[limits] = np.where(is_impact[limits], -restitution * before[limits], 0.0)
-        own = np.flatnonzero(address[:n_own] >= 0)
+    own = np.flatnonzero(address[:n_own] >= 0)
+    hit, gap_m = address[own], np.maximum(np.asarray(data.contact.dist)[own], 0.0)
+    after[hit] = -gap_m / step_s  # what does not touch yet may come so near
+    if bounces:
         restitution = np.fmin(*world.restitution[pairs[own]].T)
-        hit = address[own]
-        after[hit] = np.where(is_impact[hit], -restitution * before[hit], 0.0)
+        touches = is_impact[hit] & (before[hit] < after[hit])
+        after[hit] = np.where(touches, -restitution * before[hit], after[hit])
     for row, at in zip(rows, address[n_own:].tolist(), strict=True):
         after[at] = row.after_m_s
     sliding = np.flatnonzero((np.asarray(data.contact.dim) == 3) & (address >= 0))
@@ -226,8 +239,10 @@ def solve_velocities(
             break
         data.qacc_warmstart[:] = data.qacc
     impulses = step_s * np.asarray(data.efc_force)[address[n_own:]]
+    reached = _row_rates(world, data, found)[address[n_own:]]
+    missed_m_s = float((after[address[n_own:]] - reached).max(initial=0.0))
     meets = data.ncon > 0 or len(limits) > 0
-    return Solved(np.asarray(found), impulses, pairs.astype(np.int64), meets)
+    return Solved(np.asarray(found), impulses, pairs.astype(np.int64), meets, missed_m_s)
 
 
 def own_depth(world: World, data: mujoco.MjData, positions: NDArray[np.float64]) -> float:
@@ -260,12 +275,12 @@ def solve_displacements(world: World, data: mujoco.MjData, rows: Sequence[HullRo
     n_own = data.ncon
     for contact in range(n_own):
         data.contact[contact].dim = 1
-    _constrain(world, data, rows, has_friction=False)
+    _constrain(world, data, rows, _SOFT_MOVES, has_friction=False)
     mujoco.mj_referenceConstraint(model, data)
     kind = np.asarray(data.efc_type)
     wanted = np.zeros(data.nefc)
     is_contact = np.isin(kind, _CONTACT_ROWS)
-    wanted[is_contact] = -np.asarray(data.efc_pos)[is_contact] - SLOP_M
+    wanted[is_contact] = -np.asarray(data.contact.dist)[data.efc_id[is_contact]] - SLOP_M
     is_stop = kind == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT
     wanted[is_stop] = -np.asarray(data.efc_pos)[is_stop] - _SLOP_RAD
     data.efc_frictionloss[:] = 0.0
@@ -273,11 +288,20 @@ def solve_displacements(world: World, data: mujoco.MjData, rows: Sequence[HullRo
     data.qfrc_smooth[:], data.qacc_smooth[:], data.qacc_warmstart[:] = 0.0, 0.0, 0.0
     mujoco.mj_fwdConstraint(model, data)
     pairs = model.geom_bodyid[np.asarray(data.contact.geom)].reshape(-1, 2)
-    return Solved(np.array(data.qacc), np.zeros(len(rows)), pairs.astype(np.int64), True)
+    most_m = _MOST_MOVE * float(wanted.max(initial=0.0))
+    change = np.array(data.qacc)
+    reach_m = np.linalg.norm(change[world.dof_at[world.is_free, None] + np.arange(3)], axis=1)
+    change *= min(1.0, most_m / max(float(reach_m.max(initial=0.0)), 1e-12))
+    return Solved(change, np.zeros(len(rows)), pairs.astype(np.int64), True)
 
 
 def _constrain(
-    world: World, data: mujoco.MjData, rows: Sequence[HullRow], *, has_friction: bool = True
+    world: World,
+    data: mujoco.MjData,
+    rows: Sequence[HullRow],
+    softness: float,
+    *,
+    has_friction: bool = True,
 ) -> None:
     """Add contacts with the hull to those that MuJoCo found, and prepare the solve."""
     for row in rows:
@@ -303,7 +327,7 @@ def _constrain(
     if data.nefc == 0:
         return
     mujoco.mj_projectConstraint(world.model, data)
-    data.efc_R[:] *= _SOFT
+    data.efc_R[:] *= softness
     data.efc_D[:] = 1.0 / np.asarray(data.efc_R)
 
 

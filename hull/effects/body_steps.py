@@ -61,6 +61,7 @@ from hybridve.hull.effects.hull_contacts import (
     Patch,
     contact_of,
     find_patches,
+    shared_speeds,
 )
 from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.clusters import spatial_order
@@ -73,6 +74,10 @@ _MOST_MOVES = 3
 
 #: Faster than this, metres a second, nothing real is thrown.
 _MOST_SPEED = 1e4
+
+#: A solve that misses what contacts ask for by this share of the speeds is of what cannot be: a
+#: hand that presses a body through a table. The hull is then taken to stand.
+_MISSED = 1e-3
 
 #: A step that makes more energy than this share of the kinetic is solved again; less is rounding.
 _MADE = 1e-4
@@ -201,9 +206,9 @@ class Bodies:
         ]
         n_own = data.ncon
         hits, times = self._impacts(contacts, middle, ahead, free, step_s)
-        for bounces in (True, False):
-            if not bounces:
-                hits = [replace(hit, row=replace(hit.row, after_m_s=hit.hull_m_s)) for hit in hits]
+        for attempt in ("bounce", "rest", "stand"):
+            if attempt != "bounce":
+                hits = [_calmed(hit, stands=attempt == "stand") for hit in hits]
                 times = np.full_like(times, 0.5 * step_s)
             solved = solve_velocities(
                 world,
@@ -212,13 +217,14 @@ class Bodies:
                 [hit.row for hit in hits],
                 step_s,
                 n_own=n_own,
-                bounces=bounces,
+                bounces=attempt == "bounce",
             )
             ended = moved(world, ahead, times * (solved.change - free), 1.0)
             work_j = solved.hull_impulse * [hit.hull_m_s for hit in hits]
             kinetic, potential = energies(world, places_of(world, ended), solved.change)
             made_j = float(kinetic.sum() + potential.sum() - work_j.sum()) - before_j
-            if not solved.meets or made_j <= _MADE * float(kinetic.sum()):
+            is_passive = not solved.meets or made_j <= _MADE * float(kinetic.sum())
+            if is_passive and solved.missed_m_s <= _MISSED * max(1.0, float(np.abs(free).max())):
                 break
         if solved.meets and made_j > 0:
             solved = replace(solved, change=self._slowed(solved.change, free, made_j))
@@ -347,17 +353,11 @@ class Bodies:
     def _contacts_of(
         self, instant: Instant, body: int, patches: Sequence[Patch]
     ) -> list[HullContact]:
+        way = (instant.before, instant.hull, instant.elapsed_s)
+        if instant.recorded is not None:
+            way = (*instant.recorded, instant.recorded_s)
         size_m = self._surfaces[body].size_m
-        found = (
-            contact_of(
-                instant.hull,
-                patch,
-                size_m=size_m,
-                before=instant.before,
-                elapsed_s=instant.elapsed_s,
-            )
-            for patch in patches
-        )
+        found = (contact_of(instant.hull, patch, size_m=size_m, way=way) for patch in patches)
         return [contact for contact in found if contact is not None]
 
     def _impacts(
@@ -401,8 +401,11 @@ class Bodies:
             own = [contact for other, contact in contacts if other == body]
             points_world = np.concatenate([contact.points_world for contact in own])
             counts = [len(contact.points_world) for contact in own]
-            normals = np.repeat([contact.n_hull for contact in own], counts, axis=0)
-            hull_m_s = np.repeat([contact.speed_m_s for contact in own], counts)
+            normals = np.array([contact.n_hull for contact in own])
+            is_squeezed, speeds = shared_speeds(
+                normals, np.array([contact.speed_m_s for contact in own])
+            )
+            normals, hull_m_s = np.repeat(normals, counts, axis=0), np.repeat(speeds, counts)
             depths_m = np.concatenate([contact.depths_m for contact in own])
             arms = points_world - world.origin_world - there.center_local[body]
             approach, pull = (
@@ -417,7 +420,7 @@ class Bodies:
             since_s = np.clip(2.0 * depths_m / np.maximum(root - approach, 1e-12), 0.0, step_s)
             is_impact = approach - pull * since_s < -least_impact(step_s)
             leaves = np.zeros(len(arms))
-            if is_impact.any():
+            if is_impact.any() and not is_squeezed:
                 # All points of a body are taken at the instant of its first touch.
                 first_s = since_s[np.where(is_impact, depths_m, -1.0).argmax()]
                 at_touch = approach - pull * first_s
@@ -513,6 +516,12 @@ class Bodies:
             "angular_velocity_rad_s": angular,
             "world_from_mesh": pose,
         }
+
+
+def _calmed(hit: _Hit, *, stands: bool) -> _Hit:
+    """Return what a contact asks for if bodies do not bounce, or if the hull stands as well."""
+    hull_m_s = 0.0 if stands else hit.hull_m_s
+    return _Hit(replace(hit.row, after_m_s=hull_m_s), hull_m_s)
 
 
 def _surface_of(plan: BodyPlan, viewport: int) -> _Surface:

@@ -38,11 +38,24 @@ _LEAST_MEAN = 0.1
 #: A normal that leans more than this against V_rec (as a cosine) is not believed.
 _LEAST_COSINE = 0.2
 
+#: Directions whose cosine is below minus this are opposed.
+_OPPOSED = 0.3
+
+#: Directions that patches say less of, as a share of the most, are not said anything of.
+_LEAST_LEVERAGE = 0.3
+
 #: The footprint of a normal: a share of the body's size, and pixels at least.
 _FOOTPRINT_SHARE, _FOOTPRINT_PX = 0.2, 4.0
 
 #: The fastest that a hull is followed, metres a second.
 MOST_HULL_SPEED = 10.0
+
+#: An earlier hull, a later one, and the seconds between them, of which its speed is read; None for
+#: the first if nothing is known of it.
+Way = tuple[Hull | None, Hull | None, float]
+
+#: Of a hull that stands, or of which nothing is known.
+STANDS: Way = (None, None, 0.0)
 
 #: Rays around CP_hull, as shares of the footprint's radius: two rings and the middle.
 _RING = np.arange(8) * (np.pi / 4)
@@ -259,7 +272,7 @@ def _without_pierced(patches: list[Patch]) -> list[Patch]:
     for patch in patches:
         for other in patches:
             ahead_m = (patch.points_world[0] - other.points_world[0]) @ other.v_rec
-            is_behind = other.v_rec @ patch.v_rec < -0.3 and 0 < ahead_m <= other.out_m[0]
+            is_behind = other.v_rec @ patch.v_rec < -_OPPOSED and 0 < ahead_m <= other.out_m[0]
             if is_behind and other.out_m[0] < patch.out_m[0]:
                 break
         else:
@@ -272,8 +285,7 @@ def contact_of(
     patch: Patch,
     *,
     size_m: float,
-    before: Hull | None = None,
-    elapsed_s: float = 0.0,
+    way: Way = STANDS,
 ) -> HullContact | None:
     """Return a patch as the solver takes it; None if no point of it has a way out.
 
@@ -285,17 +297,15 @@ def contact_of(
         A contact with it.
     size_m : float
         The body's size: the diagonal of its bounding box.
-    before : Hull or None
-        An earlier hull; None if nothing is known of how fast it moves.
-    elapsed_s : float
-        How much earlier, seconds.
+    way : Way
+        What tells how fast the hull moves.
     """
     has_exit = np.isfinite(patch.out_m) & (patch.out_m > 0)
     if not has_exit.any():
         return None
     points_world, out_m = patch.points_world[has_exit], patch.out_m[has_exit]
     n_hull, speed = _surface(
-        hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, before, elapsed_s
+        hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, way
     )
     cosine = float(n_hull @ patch.v_rec)
     chosen = _deepest_and_spread(points_world)
@@ -325,8 +335,7 @@ def _surface(
     out_m: float,
     v_rec: NDArray[np.float64],
     size_m: float,
-    before: Hull | None,
-    elapsed_s: float,
+    way: Way,
 ) -> tuple[NDArray[np.float64], float]:
     """Return the normal of the hull where a point leaves it, and its speed along V_rec."""
     pixel_m = pixel_size(hull.views, point_world)
@@ -334,8 +343,9 @@ def _surface(
     side = np.cross(v_rec, np.eye(3)[np.abs(v_rec).argmin()])
     side /= np.linalg.norm(side)
     frame = np.stack([side, np.cross(v_rec, side)])  # (2, 3)
-    moves = before is not None and before is not hull and elapsed_s > 0
-    back_m = 2.0 * radius_m + (MOST_HULL_SPEED * elapsed_s if moves else 0.0)
+    first, last, seconds = way
+    moves = first is not None and first is not last and seconds > 0
+    back_m = 2.0 * radius_m + (MOST_HULL_SPEED * seconds if moves else 0.0)
     origins = point_world - back_m * v_rec + radius_m * _OFFSETS @ frame
     middle_m = back_m + out_m
     reach_m = middle_m + back_m
@@ -343,11 +353,12 @@ def _surface(
     is_near = np.abs(here_m - middle_m) <= 1.5 * radius_m
     n_hull = _plane_normal(radius_m * _OFFSETS[is_near] @ frame, here_m[is_near], v_rec)
     speed = 0.0
-    if moves and before is not None:
-        then_m = _ends_near(before, origins, v_rec, here_m, reach_m)
-        both = is_near & np.isfinite(then_m)
+    if moves and first is not None and last is not None:
+        first_m = _ends_near(first, origins, v_rec, here_m, reach_m)
+        last_m = here_m if last is hull else _ends_near(last, origins, v_rec, here_m, reach_m)
+        both = is_near & np.isfinite(first_m) & np.isfinite(last_m)
         if 2 * both.sum() >= is_near.sum() > 0:
-            speed = float((here_m - then_m)[both].mean()) / elapsed_s
+            speed = float((last_m[both] - first_m[both]).mean()) / seconds
     return n_hull, float(np.clip(speed, -MOST_HULL_SPEED, MOST_HULL_SPEED))
 
 
@@ -404,3 +415,24 @@ def _plane_normal(
         kept = np.abs(off_m) <= limit_m
     normal = normal / np.linalg.norm(normal)
     return np.asarray(normal if normal @ v_rec >= _LEAST_COSINE else v_rec)
+
+
+def shared_speeds(
+    normals: NDArray[np.float64], speeds_m_s: NDArray[np.float64]
+) -> tuple[bool, NDArray[np.float64]]:
+    """Return whether patches squeeze a body, and then the speeds at which it can follow them.
+
+    No rigid body leaves two hands that close on it. It follows the one velocity that comes nearest
+    to the speeds of all.
+
+    Parameters
+    ----------
+    normals : (P, 3) float64
+        N_hull of the patches.
+    speeds_m_s : (P,) float64
+        Of the hull along them.
+    """
+    if not (normals @ normals.T < -_OPPOSED).any():
+        return False, speeds_m_s
+    common = np.linalg.lstsq(normals, speeds_m_s, rcond=_LEAST_LEVERAGE)[0]
+    return True, np.minimum(speeds_m_s, normals @ common)
