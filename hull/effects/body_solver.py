@@ -74,6 +74,9 @@ class HullRow:
         How deep it is.
     after_m_s : float
         How fast it must leave along the normal, at least; not of displacements.
+    grips : bool
+        Whether an opposed contact presses the body against it, however hard: whatever friction
+        there is then holds.
     """
 
     body: int
@@ -81,6 +84,7 @@ class HullRow:
     normal: NDArray[np.float64]
     depth_m: float
     after_m_s: float = 0.0
+    grips: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,6 +225,9 @@ def solve_velocities(
         after[at] = row.after_m_s
     sliding = np.flatnonzero((np.asarray(data.contact.dim) == 3) & (address >= 0))
     at, share = address[sliding], np.asarray(data.contact.friction)[sliding, 0]
+    # What is gripped cannot lift off as it slides, so it does not slide.
+    grips = np.array([False] * n_own + [row.grips for row in rows])[sliding]
+    share = np.where(grips, 0.0, share)
     slip = np.hypot(before[at + 1], before[at + 2])
     data.qacc_warmstart[:] = data.qacc_smooth
     for _ in range(_MOST_SOLVES):
@@ -240,7 +247,8 @@ def solve_velocities(
         data.qacc_warmstart[:] = data.qacc
     impulses = step_s * np.asarray(data.efc_force)[address[n_own:]]
     reached = _row_rates(world, data, found)[address[n_own:]]
-    missed_m_s = float((after[address[n_own:]] - reached).max(initial=0.0))
+    asked = np.array([row.after_m_s for row in rows])
+    missed_m_s = float((asked - reached).max(initial=0.0))
     meets = data.ncon > 0 or len(limits) > 0
     return Solved(np.asarray(found), impulses, pairs.astype(np.int64), meets, missed_m_s)
 

@@ -61,7 +61,7 @@ from hybridve.hull.effects.hull_contacts import (
     Patch,
     contact_of,
     find_patches,
-    shared_speeds,
+    followed,
 )
 from hybridve.hull.query.bounds import boxes_are_free
 from hybridve.hull.query.clusters import spatial_order
@@ -78,6 +78,10 @@ _MOST_SPEED = 1e4
 #: A solve that misses what contacts ask for by this share of the speeds is of what cannot be: a
 #: hand that presses a body through a table. The hull is then taken to stand.
 _MISSED = 1e-3
+
+#: Between two hands a body stays that is off their middle by no more than this share of how deep it
+#: is in them: samples do not tell depth better.
+_OFF_MIDDLE = 0.25
 
 #: A step that makes more energy than this share of the kinetic is solved again; less is rounding.
 _MADE = 1e-4
@@ -402,7 +406,7 @@ class Bodies:
             points_world = np.concatenate([contact.points_world for contact in own])
             counts = [len(contact.points_world) for contact in own]
             normals = np.array([contact.n_hull for contact in own])
-            is_squeezed, speeds = shared_speeds(
+            is_squeezed, speeds = followed(
                 normals, np.array([contact.speed_m_s for contact in own])
             )
             normals, hull_m_s = np.repeat(normals, counts, axis=0), np.repeat(speeds, counts)
@@ -432,9 +436,14 @@ class Bodies:
             turn = here.rotation[body] @ there.rotation[body].T
             points_local = here.center_local[body] + arms @ turn.T
             hits += [
-                _Hit(HullRow(body, *row), float(speed))
+                _Hit(HullRow(body, *row, grips=is_squeezed), float(speed))
                 for *row, speed in zip(
-                    points_local, normals, depths_m, leaves + hull_m_s, hull_m_s, strict=True
+                    points_local,
+                    normals,
+                    depths_m,
+                    leaves + hull_m_s,
+                    hull_m_s,
+                    strict=True,
                 )
             ]
         return hits, times
@@ -463,18 +472,33 @@ class Bodies:
                 books.penetration_m = max(books.penetration_m, out_m)
 
     def _rows_out(self, hull: Hull, patches: Sequence[tuple[int, list[Patch]]]) -> list[HullRow]:
+        """Return what moves bodies out of the hull; from between two hands, to their middle."""
         rows = []
+        centers = places_of(self._world, self._positions).center_local
         for body, found in patches:
-            for patch in found:
-                contact = contact_of(hull, patch, size_m=self._surfaces[body].size_m)
-                if contact is not None:
-                    points_local = contact.points_world - self._world.origin_world
-                    rows += [
-                        HullRow(body, point, contact.n_hull, depth_m)
-                        for point, depth_m in zip(
-                            points_local, contact.depths_m.tolist(), strict=True
-                        )
-                    ]
+            size_m = self._surfaces[body].size_m
+            contacts = [contact_of(hull, patch, size_m=size_m) for patch in found]
+            own = [contact for contact in contacts if contact is not None]
+            if not own:
+                continue
+            deepest_m = np.array([contact.depths_m.max() for contact in own])
+            is_squeezed, shares_m = followed(
+                np.array([contact.n_hull for contact in own]), deepest_m
+            )
+            if is_squeezed:
+                is_off = shares_m > np.maximum(_OFF_MIDDLE * deepest_m, SLOP_M)
+                rows += [
+                    HullRow(body, centers[body], contact.n_hull, share_m + SLOP_M)
+                    for contact, share_m, moves in zip(own, shares_m.tolist(), is_off, strict=True)
+                    if moves
+                ]
+                continue
+            for contact in own:
+                points_local = contact.points_world - self._world.origin_world
+                rows += [
+                    HullRow(body, point, contact.n_hull, depth_m)
+                    for point, depth_m in zip(points_local, contact.depths_m.tolist(), strict=True)
+                ]
         return rows
 
     def _pushed(self, rows: Sequence[HullRow], solved: Solved) -> NDArray[np.int64]:

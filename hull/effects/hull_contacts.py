@@ -304,9 +304,7 @@ def contact_of(
     if not has_exit.any():
         return None
     points_world, out_m = patch.points_world[has_exit], patch.out_m[has_exit]
-    n_hull, speed = _surface(
-        hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, way
-    )
+    n_hull, speed = _surface(hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, way)
     cosine = float(n_hull @ patch.v_rec)
     chosen = _deepest_and_spread(points_world)
     return HullContact(
@@ -417,22 +415,22 @@ def _plane_normal(
     return np.asarray(normal if normal @ v_rec >= _LEAST_COSINE else v_rec)
 
 
-def shared_speeds(
-    normals: NDArray[np.float64], speeds_m_s: NDArray[np.float64]
+def followed(
+    normals: NDArray[np.float64], wanted: NDArray[np.float64]
 ) -> tuple[bool, NDArray[np.float64]]:
-    """Return whether patches squeeze a body, and then the speeds at which it can follow them.
+    """Return whether patches squeeze a body, and how far along each normal it then goes.
 
-    No rigid body leaves two hands that close on it. It follows the one velocity that comes nearest
-    to the speeds of all.
+    No rigid body leaves two hands that close on it. It takes the one velocity, or the one
+    displacement, that comes nearest to what all patches want.
 
     Parameters
     ----------
     normals : (P, 3) float64
         N_hull of the patches.
-    speeds_m_s : (P,) float64
-        Of the hull along them.
+    wanted : (P,) float64
+        Speeds or displacements along them.
     """
     if not (normals @ normals.T < -_OPPOSED).any():
-        return False, speeds_m_s
-    common = np.linalg.lstsq(normals, speeds_m_s, rcond=_LEAST_LEVERAGE)[0]
-    return True, np.minimum(speeds_m_s, normals @ common)
+        return False, wanted
+    common = np.linalg.lstsq(normals, wanted, rcond=_LEAST_LEVERAGE)[0]
+    return True, normals @ common

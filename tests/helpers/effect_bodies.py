@@ -76,9 +76,7 @@ def joined_hull(views: Views, hulls: Sequence[Hull]) -> Hull:
 
 def empty_hull(views: Views) -> Hull:
     """Return the hull of an empty room."""
-    return make_hull(
-        views, [np.zeros((int(h), int(w)), np.uint8) for w, h in views.sizes_px]
-    )
+    return make_hull(views, [np.zeros((int(h), int(w)), np.uint8) for w, h in views.sizes_px])
 
 
 def scene_object(
