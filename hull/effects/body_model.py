@@ -21,8 +21,8 @@ from hybridve.hull.effects.effect import GRAVITY_M_S2
 #: makes them harder still.
 _HARD = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
-#: Bodies this near to each other are asked not to come nearer than touching, metres: what is stacked
-#: without a gap stays where it is.
+#: Bodies this near to each other are asked not to come nearer than touching, metres: what is
+#: stacked without a gap stays where it is.
 _NEAR_M = 1e-4
 
 #: What collides is at most in so many pieces: more take minutes to prepare.

@@ -17,17 +17,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from hybridve.hull.jit import compiled
 from hybridve.hull.query.engine import Hits, Triangles
 from hybridve.hull.query.silhouettes import Hull, Views
 from hybridve.hull.query.viewport import sample_positions
 from hybridve.hull.query.walk import spans_of_rays
 
 #: Collision points that are grouped, and those of a patch whose way out is measured, at most.
-_MOST_POINTS, _MOST_RAYS = 400, 24
+_MOST_POINTS, _MOST_RAYS = 600, 16
 
 #: Contacts of a patch at most: a face needs its corners.
 MOST_CONTACTS = 6
@@ -188,15 +186,36 @@ def find_patches(
     return _without_pierced(patches)
 
 
-def _clusters(points_world: NDArray[np.float64], near_m: float) -> NDArray[np.int32]:
+@compiled
+def _clusters(points: NDArray[np.float64], near_m: float) -> NDArray[np.int64]:
     """Return a number for each point, the same for those that steps of `near_m` join."""
-    n_points = len(points_world)
-    if np.ptp(points_world, axis=0).max() <= near_m:
-        return np.zeros(n_points, np.int32)
-    pairs = cKDTree(points_world).query_pairs(near_m, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_points, n_points))
-    label: NDArray[np.int32] = connected_components(graph, directed=False)[1]
+    n_points = len(points)
+    label = np.full(n_points, -1, np.int64)
+    waiting = np.zeros(n_points, np.int64)
+    number = -1
+    for start in range(n_points):
+        if label[start] >= 0:
+            continue
+        number += 1
+        label[start] = number
+        waiting[0], n_waiting = start, 1
+        while n_waiting > 0:
+            n_waiting -= 1
+            here = waiting[n_waiting]
+            for other in range(n_points):
+                if label[other] < 0 and _squared(points, here, other) <= near_m * near_m:
+                    label[other] = number
+                    waiting[n_waiting] = other
+                    n_waiting += 1
     return label
+
+
+@compiled
+def _squared(points: NDArray[np.float64], one: int, other: int) -> float:
+    x = points[one, 0] - points[other, 0]
+    y = points[one, 1] - points[other, 1]
+    z = points[one, 2] - points[other, 2]
+    return x * x + y * y + z * z
 
 
 def _patch(
@@ -224,7 +243,8 @@ def _patch(
         v_rec = tangent if tangent @ v_rec >= 0 else -tangent
     length = float(np.linalg.norm(v_rec))
     v_rec = v_rec / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    chosen = points_world[_spread(points_world, _MOST_RAYS)]
+    farthest = int(((points_world - middle) ** 2).sum(axis=1).argmax())
+    chosen = points_world[_spread(points_world, farthest, _MOST_RAYS)]
     found = _ways_out(hull, chosen, v_rec, reach_m)
     if not is_closed:
         other = _ways_out(hull, chosen, -v_rec, reach_m)
@@ -234,20 +254,28 @@ def _patch(
     return Patch(chosen[order], found[order], v_rec)
 
 
-def _spread(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+@compiled
+def _spread(points: NDArray[np.float64], first: int, most: int) -> NDArray[np.int64]:
     """Return the numbers of points that lie far from each other: each farthest from those before.
 
-    The first is the one farthest from their mean.
+    Points at the place of one that was chosen are none.
     """
-    if len(points) <= most:
-        return np.arange(len(points))
-    apart = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
-    chosen = [int(apart.argmax())]
-    apart = ((points - points[chosen[0]]) ** 2).sum(axis=1)
-    while len(chosen) < most:
-        chosen.append(int(apart.argmax()))
-        apart = np.minimum(apart, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-    return np.array(chosen)
+    n_points = len(points)
+    chosen = np.zeros(min(most, n_points), np.int64)
+    apart = np.full(n_points, np.inf)
+    latest = first
+    for count in range(len(chosen)):
+        chosen[count] = latest
+        apart[latest] = 0.0
+        farthest = latest
+        for point in range(n_points):
+            apart[point] = min(apart[point], _squared(points, latest, point))
+            if apart[point] > apart[farthest]:
+                farthest = point
+        if apart[farthest] <= 0.0:
+            return chosen[: count + 1]
+        latest = farthest
+    return chosen
 
 
 def _ways_out(
@@ -306,7 +334,10 @@ def contact_of(
     points_world, out_m = patch.points_world[has_exit], patch.out_m[has_exit]
     n_hull, speed = _surface(hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, way)
     cosine = float(n_hull @ patch.v_rec)
-    chosen = _deepest_and_spread(points_world)
+    # The corners of a face first; the deepest may lie between them.
+    apart = ((points_world - points_world.mean(axis=0)) ** 2).sum(axis=1)
+    chosen = _spread(np.ascontiguousarray(points_world), int(apart.argmax()), MOST_CONTACTS - 1)
+    chosen = np.concatenate([[0], chosen[chosen != 0]])
     return HullContact(
         points_world[chosen],
         out_m[chosen] * cosine,
@@ -315,16 +346,6 @@ def contact_of(
         patch.v_rec,
         float(out_m[0]),
     )
-
-
-def _deepest_and_spread(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the first and those that lie far from it and from each other."""
-    chosen = [0]
-    apart = ((points - points[0]) ** 2).sum(axis=1)
-    while len(chosen) < MOST_CONTACTS and apart.max() > 0:
-        chosen.append(int(apart.argmax()))
-        apart = np.minimum(apart, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-    return np.array(chosen)
 
 
 def _surface(
