@@ -16,6 +16,9 @@ from scipy.spatial import ConvexHull, QhullError
 #: A part is convex if its vertices lie no farther inside their convex hull, as a share of its size.
 _CONVEX = 1e-4
 
+#: And if it encloses what the hull does, to this share.
+_SAME_VOLUME = 1e-3
+
 #: Thickness of the prisms that stand for triangles: a share of the part's size, within bounds.
 _PRISM_SHARE, _PRISM_LEAST_M, _PRISM_MOST_M = 0.02, 5e-4, 5e-3
 
@@ -160,20 +163,27 @@ def _connected_parts(
 
 
 def _off_convex(points: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
-    """Return how far points lie inside of their convex hull at most; infinite if it is flat.
+    """Return how far a closed surface lies inside of its convex hull at most.
 
-    Or if the surface folds within it: its area is then larger than that of the hull.
+    At its vertices, the middles of its edges and of its triangles; infinite if it encloses less
+    than the hull does, as what is hollowed out between all of these, or if the hull is flat.
     """
     try:
         hull = ConvexHull(points)
     except QhullError:
         return np.inf
-    a, b, c = np.moveaxis(points[faces], 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
-    if area > hull.area * (1.0 + 1e-3):
+    corners = points[faces]
+    a, b, c = np.moveaxis(corners - points[0], 1, 0)
+    volume = abs(float(np.einsum("ij,ij->", a, np.cross(b, c)))) / 6.0
+    if abs(volume - hull.volume) > _SAME_VOLUME * hull.volume:
         return np.inf
-    inside = points @ hull.equations[:, :3].T + hull.equations[:, 3]  # not positive
-    return float(-inside.max(axis=1).min())
+    middles = [(corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2.0, corners.mean(axis=1)]
+    on_surface = np.concatenate([points, *middles])
+    planes = np.unique(hull.equations.round(12), axis=0)
+    inside = np.full(len(on_surface), -np.inf)
+    for plane in planes:
+        np.maximum(inside, on_surface @ plane[:3] + plane[3], out=inside)
+    return float(-inside.min())
 
 
 def _prisms(

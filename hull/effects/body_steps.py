@@ -79,6 +79,9 @@ _MOST_SPEED = 1e4
 #: hand that presses a body through a table. The hull is then taken to stand.
 _MISSED = 1e-3
 
+#: What has moved by less, in metres and parts of a turn, is where it was.
+_SAME_PLACE = 1e-8
+
 #: Between two hands a body stays that is off their middle by no more than this share of how deep it
 #: is in them: samples do not tell depth better.
 _OFF_MIDDLE = 0.25
@@ -178,6 +181,15 @@ class _Hit:
     hull_m_s: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """What was asked of a hull last: what rests need not ask again."""
+
+    instant: Instant
+    positions: NDArray[np.float64]
+    contacts: Sequence[tuple[int, HullContact]]
+
+
 class Bodies:
     """All rigid and hinged bodies of a scene; see `hybridve.hull.effects.effect.Effect`."""
 
@@ -192,6 +204,8 @@ class Bodies:
         self._positions, self._velocities = start_of(self._world)
         self._potential_at_start_j = self._energies()[1]
         self._books = [_Books() for _ in plans]
+        self._asked: _Asked | None = None
+        self._moved_out: tuple[Hull, NDArray[np.float64]] | None = None
         self.told = {plan.name: _told_of(self._world, plan) for plan in plans}
 
     def advance(self, instant: Instant, step_s: float) -> None:
@@ -203,11 +217,7 @@ class Bodies:
         free = free_velocities(world, data, middle, self._velocities, step_s)
         self._check(free)
         ahead = moved(world, middle, free, 0.5 * step_s)
-        contacts = [
-            (body, contact)
-            for body, patches in self._patches(instant.hull, ahead)
-            for contact in self._contacts_of(instant, body, patches)
-        ]
+        contacts = self._contacts(instant, ahead)
         n_own = data.ncon
         hits, times = self._impacts(contacts, middle, ahead, free, step_s)
         for attempt in ("bounce", "rest", "stand"):
@@ -258,10 +268,12 @@ class Bodies:
                 ),
             }
             books.begin_frame()
+        self._forget()
         return found
 
     def state(self) -> Mapping[str, NDArray[Any]]:
         """Return all that decides how it goes on, as arrays."""
+        self._forget()
         return {
             "positions": self._positions.copy(),
             "velocities": self._velocities.copy(),
@@ -274,6 +286,7 @@ class Bodies:
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go on from what `state` gave, to the same values to the bit."""
+        self._forget()
         self._positions = np.array(state["positions"], np.float64)
         self._velocities = np.array(state["velocities"], np.float64)
         self._books = [
@@ -287,6 +300,10 @@ class Bodies:
                 strict=True,
             )
         ]
+
+    def _forget(self) -> None:
+        """Ask the hull anew: whoever goes on from a state has not asked it."""
+        self._asked, self._moved_out = None, None
 
     def _energies(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         places = places_of(self._world, self._positions)
@@ -353,6 +370,24 @@ class Bodies:
             if patches:
                 found.append((body, patches))
         return found
+
+    def _contacts(
+        self, instant: Instant, positions: NDArray[np.float64]
+    ) -> Sequence[tuple[int, HullContact]]:
+        """Return the bodies that the hull meets at positions (nq,), once for each contact."""
+        asked = self._asked
+        if (
+            asked is None
+            or asked.instant is not instant
+            or np.abs(asked.positions - positions).max() > _SAME_PLACE
+        ):
+            found = tuple(
+                (body, contact)
+                for body, patches in self._patches(instant.hull, positions)
+                for contact in self._contacts_of(instant, body, patches)
+            )
+            self._asked = asked = _Asked(instant, positions, found)
+        return asked.contacts
 
     def _contacts_of(
         self, instant: Instant, body: int, patches: Sequence[Patch]
@@ -451,11 +486,16 @@ class Bodies:
     def _move_out(self, hull: Hull, *, near_hull: bool) -> None:
         """Move bodies out of the hull, of CAD and of each other, and tell how deep they stay."""
         world, data = self._world, self._data
+        if self._moved_out is not None:
+            last, positions = self._moved_out
+            if last is hull and np.abs(positions - self._positions).max() <= _SAME_PLACE:
+                return
         patches = self._patches(hull, self._positions) if near_hull else []
         for _ in range(_MOST_MOVES):
             own_m = own_depth(world, data, self._positions)
             rows = self._rows_out(hull, patches)
             if own_m <= 0 and all(row.depth_m <= 1.01 * SLOP_M for row in rows):
+                self._moved_out = (hull, self._positions) if near_hull else None
                 break
             solved = solve_displacements(world, data, rows)
             before = self._energies()[1]

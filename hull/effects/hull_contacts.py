@@ -14,6 +14,7 @@ How fast the hull moves is what the same rays say of an earlier hull.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,7 +169,9 @@ def find_patches(
     edges_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     spacing_m = float((edges_m / np.maximum(viewports - 1.0, 1.0)).max())
     thinning = max(1.0, len(hits) / len(points_world))
-    label = _clusters(points_world, 1.7 * spacing_m * thinning**0.5)
+    # A silhouette's staircase parts what one surface touches.
+    pixel_m = pixel_size(hull.views, points_world[0])
+    label = _clusters(points_world, max(1.7 * spacing_m * thinning**0.5, 2.0 * pixel_m))
     patches = []
     for number in range(int(label.max()) + 1):
         is_here = label == number
@@ -332,31 +335,53 @@ def contact_of(
     if not has_exit.any():
         return None
     points_world, out_m = patch.points_world[has_exit], patch.out_m[has_exit]
-    n_hull, speed = _surface(hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, way)
-    cosine = float(n_hull @ patch.v_rec)
+    surface = _surface_at(hull, points_world[0], float(out_m[0]), patch.v_rec, size_m, way)
+    cosine = float(surface.n_hull @ patch.v_rec)
+    depths_m = out_m * cosine
+    # Under the footprint the plane knows better than a single exit, which may be on any stair.
+    is_under = np.linalg.norm(points_world - points_world[0], axis=1) < surface.radius_m
+    depths_m[is_under] = (surface.point_world - points_world[is_under]) @ surface.n_hull
+    if depths_m.max() <= 0:  # the whole patch is on one stair that sticks out
+        depths_m = out_m * cosine
+    order = np.argsort(-depths_m, kind="stable")
+    order = order[depths_m[order] > 0]
+    points_world, depths_m = points_world[order], depths_m[order]
     # The corners of a face first; the deepest may lie between them.
     apart = ((points_world - points_world.mean(axis=0)) ** 2).sum(axis=1)
     chosen = _spread(np.ascontiguousarray(points_world), int(apart.argmax()), MOST_CONTACTS - 1)
     chosen = np.concatenate([[0], chosen[chosen != 0]])
     return HullContact(
         points_world[chosen],
-        out_m[chosen] * cosine,
-        n_hull,
-        speed * cosine,
+        depths_m[chosen],
+        surface.n_hull,
+        surface.speed_m_s * cosine,
         patch.v_rec,
-        float(out_m[0]),
+        float(depths_m[0] / cosine),
     )
 
 
-def _surface(
+class _Surface(NamedTuple):
+    """The plane that stands for the hull where a patch leaves it.
+
+    `point_world` lies on it, `n_hull` is its normal, `radius_m` how large the footprint was that it
+    was taken from, and `speed_m_s` its speed along V_rec.
+    """
+
+    point_world: NDArray[np.float64]
+    n_hull: NDArray[np.float64]
+    radius_m: float
+    speed_m_s: float
+
+
+def _surface_at(
     hull: Hull,
     point_world: NDArray[np.float64],
     out_m: float,
     v_rec: NDArray[np.float64],
     size_m: float,
     way: Way,
-) -> tuple[NDArray[np.float64], float]:
-    """Return the normal of the hull where a point leaves it, and its speed along V_rec."""
+) -> _Surface:
+    """Return the hull's surface where a point leaves it along V_rec after a way."""
     pixel_m = pixel_size(hull.views, point_world)
     radius_m = max(_FOOTPRINT_SHARE * size_m, _FOOTPRINT_PX * pixel_m)
     side = np.cross(v_rec, np.eye(3)[np.abs(v_rec).argmin()])
@@ -370,7 +395,8 @@ def _surface(
     reach_m = middle_m + back_m
     here_m = _ends_near(hull, origins, v_rec, np.full(len(origins), middle_m), reach_m)
     is_near = np.abs(here_m - middle_m) <= 1.5 * radius_m
-    n_hull = _plane_normal(radius_m * _OFFSETS[is_near] @ frame, here_m[is_near], v_rec)
+    beside = radius_m * _OFFSETS @ frame
+    shift, n_hull = _plane(beside[is_near], here_m[is_near] - back_m, v_rec, out_m)
     speed = 0.0
     if moves and first is not None and last is not None:
         first_m = _ends_near(first, origins, v_rec, here_m, reach_m)
@@ -378,7 +404,8 @@ def _surface(
         both = is_near & np.isfinite(first_m) & np.isfinite(last_m)
         if 2 * both.sum() >= is_near.sum() > 0:
             speed = float((last_m[both] - first_m[both]).mean()) / seconds
-    return n_hull, float(np.clip(speed, -MOST_HULL_SPEED, MOST_HULL_SPEED))
+    speed = float(np.clip(speed, -MOST_HULL_SPEED, MOST_HULL_SPEED))
+    return _Surface(point_world + shift, n_hull, radius_m, speed)
 
 
 def pixel_size(views: Views, point_world: NDArray[np.float64]) -> float:
@@ -407,33 +434,39 @@ def _ends_near(
     return ends_m
 
 
-def _plane_normal(
-    beside: NDArray[np.float64], ahead_m: NDArray[np.float64], v_rec: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the normal of the plane through points `beside` (K, 3) + `ahead_m` V_rec.
+def _plane(
+    beside: NDArray[np.float64],
+    ahead_m: NDArray[np.float64],
+    v_rec: NDArray[np.float64],
+    out_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a point and the normal of the plane through points `beside` (K, 3) + `ahead_m` V_rec.
 
-    Those that lie far from it are left out once: beyond an edge the hull is another surface. V_rec
-    where they span no plane, or one that leans too far.
+    Those that lie far from it are left out once: beyond an edge the hull is another surface. Across
+    V_rec at `out_m` where they span no plane, or one that leans too far.
     """
+    unknown = out_m * v_rec, v_rec
     kept = np.ones(len(beside), np.bool_)
-    normal = v_rec
+    middle, normal = unknown
     for _ in range(2):
         if kept.sum() < 4:
-            return v_rec
-        from_middle = beside[kept] - beside[kept].mean(axis=0)
+            return unknown
+        middle = beside[kept].mean(axis=0)
+        from_middle = beside[kept] - middle
         spread, axes = np.linalg.eigh(from_middle.T @ from_middle)
         if spread[1] < 0.05 * spread[2]:  # spread[0] is along V_rec: they lie on a line
-            return v_rec
+            return unknown
         slopes = (axes[:, 1:].T @ (from_middle.T @ ahead_m[kept])) / spread[1:]
         tilt = axes[:, 1:] @ slopes
-        normal = v_rec - tilt
-        off_m = ahead_m - ahead_m[kept].mean() - (beside - beside[kept].mean(axis=0)) @ tilt
+        mean_m = float(ahead_m[kept].mean())
+        normal, middle = v_rec - tilt, middle + mean_m * v_rec
+        off_m = ahead_m - mean_m - (beside - beside[kept].mean(axis=0)) @ tilt
         limit_m = 2.0 * float(np.sqrt(np.mean(off_m[kept] ** 2))) + 1e-9
         if (np.abs(off_m) <= limit_m).sum() == kept.sum():
             break
         kept = np.abs(off_m) <= limit_m
     normal = normal / np.linalg.norm(normal)
-    return np.asarray(normal if normal @ v_rec >= _LEAST_COSINE else v_rec)
+    return unknown if normal @ v_rec < _LEAST_COSINE else (middle, np.asarray(normal))
 
 
 def followed(

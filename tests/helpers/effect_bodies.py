@@ -26,7 +26,7 @@ BOX_FACES = np.array(
         *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
     ],
     np.int32,
-)
+)[:, ::-1]
 
 
 def level_views(height_m: float = 0.0, n_cameras: int = 4, distance_m: float = 3.0) -> Views:
@@ -45,7 +45,7 @@ def level_views(height_m: float = 0.0, n_cameras: int = 4, distance_m: float = 3
 
 
 def far_views(pixel_m: float = 0.0005, size_px: int = 800, distance_m: float = 300.0) -> Views:
-    """Return cameras so far off along x, y and z that the hull of a box along these axes is the box.
+    """Return cameras so far off along x, y and z that the hull of a box along them is the box.
 
     To half a pixel; and what is 0.1 m nearer is a fifteenth of a millimetre larger at the rim.
     """
@@ -146,13 +146,14 @@ class Stage:
         instant = Instant(self.time_s, hull, before, elapsed_s, self.n_instants)
         for _ in range(n_steps):
             self.effect.advance(instant, step_s)
-            self.told.append({name: dict(row) for name, row in self.effect.values().items()})
+        self.told.append({name: dict(row) for name, row in self.effect.values().items()})
         self.before = hull
 
-    def hold(self, hull: Hull, n_steps: int, step_s: float = STEP_S) -> None:
-        """Go on by many steps in a hull that stands."""
+    def hold(self, hull: Hull, n_steps: int, step_s: float = STEP_S, *, each: int = 1) -> None:
+        """Go on by many steps in a hull that stands; what is told is kept after every so many."""
         self.before = hull
-        self.step(hull, n_steps, step_s)
+        for _ in range(n_steps // each):
+            self.step(hull, each, step_s)
 
     def column(self, name: str, column: str) -> NDArray[Any]:
         """Return what was told of an entry after each step."""
