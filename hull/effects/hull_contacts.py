@@ -67,6 +67,10 @@ _OFFSETS = np.concatenate(
 )
 
 
+#: With this share of its rays a footprint is whole.
+_WHOLE = 0.8
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Arc:
     """The way that a hinged body can go.
@@ -395,8 +399,11 @@ def _surface_at(
     reach_m = middle_m + back_m
     here_m = _ends_near(hull, origins, v_rec, np.full(len(origins), middle_m), reach_m)
     is_near = np.abs(here_m - middle_m) <= 1.5 * radius_m
-    beside = radius_m * _OFFSETS @ frame
-    shift, n_hull = _plane(beside[is_near], here_m[is_near] - back_m, v_rec, out_m)
+    ahead_m, slopes = _plane(radius_m * _OFFSETS[is_near], here_m[is_near] - back_m, out_m)
+    n_hull = v_rec - slopes @ frame
+    n_hull /= np.linalg.norm(n_hull)
+    if n_hull @ v_rec < _LEAST_COSINE:
+        ahead_m, n_hull = out_m, v_rec
     speed = 0.0
     if moves and first is not None and last is not None:
         first_m = _ends_near(first, origins, v_rec, here_m, reach_m)
@@ -405,7 +412,7 @@ def _surface_at(
         if 2 * both.sum() >= is_near.sum() > 0:
             speed = float((last_m[both] - first_m[both]).mean()) / seconds
     speed = float(np.clip(speed, -MOST_HULL_SPEED, MOST_HULL_SPEED))
-    return _Surface(point_world + shift, n_hull, radius_m, speed)
+    return _Surface(point_world + ahead_m * v_rec, n_hull, radius_m, speed)
 
 
 def pixel_size(views: Views, point_world: NDArray[np.float64]) -> float:
@@ -435,38 +442,32 @@ def _ends_near(
 
 
 def _plane(
-    beside: NDArray[np.float64],
-    ahead_m: NDArray[np.float64],
-    v_rec: NDArray[np.float64],
-    out_m: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a point and the normal of the plane through points `beside` (K, 3) + `ahead_m` V_rec.
+    beside_m: NDArray[np.float64], ahead_m: NDArray[np.float64], unknown_m: float
+) -> tuple[float, NDArray[np.float64]]:
+    """Return how far ahead the surface through points is in their middle, and its slopes (2,).
 
-    Those that lie far from it are left out once: beyond an edge the hull is another surface. Across
-    V_rec at `out_m` where they span no plane, or one that leans too far.
+    Of points `beside_m` (K, 2) and `ahead_m` (K,), in one frame. With nearly all of the footprint
+    the surface may bulge evenly; else it is a plane. Points that lie far from it are left out once:
+    beyond an edge the hull is another surface. Flat, at what is known, where they lie on a line.
     """
-    unknown = out_m * v_rec, v_rec
-    kept = np.ones(len(beside), np.bool_)
-    middle, normal = unknown
+    kept = np.ones(len(beside_m), np.bool_)
+    bulge = (beside_m**2).sum(axis=1, keepdims=True)
+    found = np.array([unknown_m, 0.0, 0.0])
     for _ in range(2):
-        if kept.sum() < 4:
-            return unknown
-        middle = beside[kept].mean(axis=0)
-        from_middle = beside[kept] - middle
-        spread, axes = np.linalg.eigh(from_middle.T @ from_middle)
-        if spread[1] < 0.05 * spread[2]:  # spread[0] is along V_rec: they lie on a line
-            return unknown
-        slopes = (axes[:, 1:].T @ (from_middle.T @ ahead_m[kept])) / spread[1:]
-        tilt = axes[:, 1:] @ slopes
-        mean_m = float(ahead_m[kept].mean())
-        normal, middle = v_rec - tilt, middle + mean_m * v_rec
-        off_m = ahead_m - mean_m - (beside - beside[kept].mean(axis=0)) @ tilt
-        limit_m = 2.0 * float(np.sqrt(np.mean(off_m[kept] ** 2))) + 1e-9
-        if (np.abs(off_m) <= limit_m).sum() == kept.sum():
+        spread = np.linalg.eigvalsh(np.cov(beside_m[kept].T)) if kept.sum() >= 4 else np.zeros(2)
+        if spread[0] <= 0.05 * spread[1]:
+            return unknown_m, np.zeros(2)
+        columns = [np.ones((len(beside_m), 1)), beside_m]
+        if kept.sum() >= _WHOLE * len(_OFFSETS):
+            columns.append(bulge / bulge.max())
+        terms = np.hstack(columns)
+        found = np.linalg.lstsq(terms[kept], ahead_m[kept], rcond=None)[0]
+        off_m = np.abs(ahead_m - terms @ found)
+        is_close = off_m <= 2.0 * float(np.sqrt(np.mean(off_m[kept] ** 2))) + 1e-9
+        if is_close.sum() == kept.sum():
             break
-        kept = np.abs(off_m) <= limit_m
-    normal = normal / np.linalg.norm(normal)
-    return unknown if normal @ v_rec < _LEAST_COSINE else (middle, np.asarray(normal))
+        kept = is_close
+    return float(found[0]), found[1:3]
 
 
 def followed(
