@@ -297,6 +297,19 @@ def test_a_hull_that_appears_in_a_body_moves_it_and_gives_it_no_speed() -> None:
     assert played.column("ball", "kinetic_j").max() == 0.0
 
 
+def test_what_a_hull_swallows_falls_as_if_there_were_none() -> None:
+    """No way out within reach is known: nothing is done, and how deep it is at least is told."""
+    views = level_views()
+    everywhere = make_hull(views, [np.ones((486, 720), np.uint8)] * 4)
+    played = stage(views, [ball("ball", [0, 0, 0])], [rigid("ball")])
+    played.hold(everywhere, 20)
+    fallen_m = GRAVITY_M_S2 * (20 * STEP_S) ** 2 / 2
+    assert played.column("ball", "position_m")[-1, 2] == pytest.approx(-fallen_m, abs=1e-9)
+    assert played.column("ball", "n_contacts").max() == 0
+    # Twice the diagonal of its box.
+    assert played.column("ball", "penetration_m")[-1] == pytest.approx(2 * 3**0.5 * 0.1, rel=0.01)
+
+
 def test_what_a_hull_lifts_out_is_work_of_the_hull() -> None:
     played = stage(far(), [ball("ball", [0, 0, 0.03])], [rigid("ball")])
     played.step(floor(), is_known=False)

@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SceneError
 from hybridve.calib.pose import rotation_of
 from hybridve.hull.cad.scene import SceneObject
-from hybridve.hull.effects.body_shape import CollisionShape, MassShare, collision_shape
+from hybridve.hull.effects.body_shape import (
+    CollisionShape,
+    MassShare,
+    collision_shape,
+    cross,
+)
 from hybridve.hull.effects.effect import GRAVITY_M_S2
 
 #: How hard MuJoCo's constraints are: as hard as it allows. `hybridve.hull.effects.body_solver`
@@ -294,7 +299,7 @@ def _mass_diagonal(
             diagonal[at + 3 : at + 6] = inertia
         else:
             axis = plan.hinge.axis
-            arm = np.cross(axis, plan.share.center - plan.hinge.anchor_world)
+            arm = cross(axis, plan.share.center - plan.hinge.anchor_world)
             about_center = inertia @ (plan.share.axes.T @ axis) ** 2
             diagonal[at] = about_center + plan.mass_kg * (arm @ arm)
     return diagonal
@@ -371,7 +376,7 @@ def twist_of(
         return rates[at : at + 3], places.rotation[body] @ rates[at + 3 : at + 6]
     turning = rates[at] * hinge.axis
     arm = places.center_local[body] - (hinge.anchor_world - world.origin_world)
-    return np.cross(turning, arm), turning
+    return cross(turning, arm), turning
 
 
 def energies(

@@ -26,6 +26,15 @@ _PRISM_SHARE, _PRISM_LEAST_M, _PRISM_MOST_M = 0.02, 5e-4, 5e-3
 _LEAST_HEIGHT_M = 1e-6
 
 
+def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cross products of vectors (..., 3): NumPy's takes ten times as long for few."""
+    product = np.zeros(np.broadcast_shapes(a.shape, b.shape))
+    product[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    product[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    product[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return product
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MassShare:
     """How mass is spread over a mesh, for a mass of 1 kg.
@@ -77,10 +86,10 @@ def mass_share(
     origin = vertices[faces[0, 0]]
     corners = vertices[faces] - origin  # (T, 3, 3)
     a, b, c = np.moveaxis(corners, 1, 0)
-    across = np.cross(b - a, c - a)
+    across = cross(b - a, c - a)
     areas = np.linalg.norm(across, axis=1) / 2.0
     size_m = float(np.ptp(vertices[faces.ravel()], axis=0).max())
-    measure = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0 if is_closed else areas
+    measure = np.einsum("ij,ij->i", a, cross(b, c)) / 6.0 if is_closed else areas
     n_corners = 4.0 if is_closed else 3.0  # of a tetrahedron, the fourth lies at the origin
     total = float(measure.sum())
     if not abs(total) > 1e-12 * size_m ** (3 if is_closed else 2):
@@ -174,7 +183,7 @@ def _off_convex(points: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
         return np.inf
     corners = points[faces]
     a, b, c = np.moveaxis(corners - points[0], 1, 0)
-    volume = abs(float(np.einsum("ij,ij->", a, np.cross(b, c)))) / 6.0
+    volume = abs(float(np.einsum("ij,ij->", a, cross(b, c)))) / 6.0
     if abs(volume - hull.volume) > _SAME_VOLUME * hull.volume:
         return np.inf
     middles = [(corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2.0, corners.mean(axis=1)]
@@ -191,13 +200,13 @@ def _prisms(
 ) -> list[NDArray[np.float64]]:
     """Return for each triangle (T, 3, 3) that has an area the corners (6, 3) of a prism."""
     along = np.roll(corners, -1, axis=1) - corners
-    across = np.cross(along[:, 0], along[:, 1])
+    across = cross(along[:, 0], along[:, 1])
     double = np.linalg.norm(across, axis=1)
     has_area = double > _LEAST_HEIGHT_M * np.linalg.norm(along, axis=2).max(axis=1)
     corners, normals = corners[has_area], across[has_area] / double[has_area, None]
     if is_closed:
         a, b, c = np.moveaxis(corners - corners[0, 0], 1, 0)
-        inwards = -np.sign(np.einsum("ij,ij->", a, np.cross(b, c)))
+        inwards = -np.sign(np.einsum("ij,ij->", a, cross(b, c)))
         begin, end = np.zeros_like(normals), inwards * thick_m * normals
     else:
         begin, end = -thick_m / 2.0 * normals, thick_m / 2.0 * normals

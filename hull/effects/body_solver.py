@@ -29,10 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.effects.body_model import World
+from hybridve.hull.effects.body_shape import cross
 from hybridve.hull.effects.effect import GRAVITY_M_S2
 
 #: What remains of MuJoCo's softness. A tonne on a gram sinks by less than a micrometre a second.
-_SOFT = 1e-8
+_SOFT = 1e-6
 
 #: The same of displacements, of which a hundredth may be left: of two hands that are not quite
 #: parallel, the way out is far to the side, and no body takes it.
@@ -163,7 +164,7 @@ def _gyroscopic(
     torque = np.zeros_like(before)
     for _ in range(_GYRATIONS):
         mean = before - (0.5 * step_s) * torque / inertia
-        then = np.cross(mean, inertia * mean)
+        then = cross(mean, inertia * mean)
         if np.abs(then - torque).max() <= 1e-14 * np.abs(then).max():
             break
         torque = then
@@ -316,9 +317,9 @@ def _constrain(
         contact = mujoco.MjContact()
         contact.dist = -row.depth_m
         contact.pos = row.point_local
-        side = np.cross(row.normal, np.eye(3)[np.abs(row.normal).argmin()])
+        side = cross(row.normal, np.eye(3)[np.abs(row.normal).argmin()])
         side /= np.linalg.norm(side)
-        contact.frame = np.concatenate([row.normal, side, np.cross(row.normal, side)])
+        contact.frame = np.concatenate([row.normal, side, cross(row.normal, side)])
         contact.includemargin = 0.0
         friction = world.plans[row.body].friction if has_friction else 0.0
         contact.friction = [friction, friction, 0.0, 0.0, 0.0]

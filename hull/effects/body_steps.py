@@ -35,7 +35,7 @@ from hybridve.hull.effects.body_model import (
     start_of,
     twist_of,
 )
-from hybridve.hull.effects.body_shape import CollisionShape
+from hybridve.hull.effects.body_shape import CollisionShape, cross
 from hybridve.hull.effects.body_solver import (
     SLOP_M,
     HullRow,
@@ -87,7 +87,7 @@ _SAME_PLACE = 1e-8
 _OFF_MIDDLE = 0.25
 
 #: A step that makes more energy than this share of the kinetic is solved again; less is rounding.
-_MADE = 1e-4
+_MADE = 1e-3
 
 _POSE = Quantity(
     "world_from_mesh",
@@ -183,10 +183,14 @@ class _Hit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Asked:
-    """What was asked of a hull last: what rests need not ask again."""
+    """What was asked of a hull last: what rests need not ask again.
+
+    `meets` says whether any body has samples in it, also such as have no way out.
+    """
 
     instant: Instant
     positions: NDArray[np.float64]
+    meets: bool
     contacts: Sequence[tuple[int, HullContact]]
 
 
@@ -217,7 +221,8 @@ class Bodies:
         free = free_velocities(world, data, middle, self._velocities, step_s)
         self._check(free)
         ahead = moved(world, middle, free, 0.5 * step_s)
-        contacts = self._contacts(instant, ahead)
+        asked = self._ask(instant, ahead)
+        contacts = asked.contacts
         n_own = data.ncon
         hits, times = self._impacts(contacts, middle, ahead, free, step_s)
         for attempt in ("bounce", "rest", "stand"):
@@ -248,7 +253,7 @@ class Bodies:
         for body, contact in contacts:
             self._books[body].meet(contact)
         self._check(self._velocities)
-        self._move_out(instant.hull, near_hull=bool(contacts))
+        self._move_out(instant.hull, near_hull=asked.meets)
 
     def values(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
         """Return by entry and column what stands at the end of a frame; counts begin anew."""
@@ -371,23 +376,22 @@ class Bodies:
                 found.append((body, patches))
         return found
 
-    def _contacts(
-        self, instant: Instant, positions: NDArray[np.float64]
-    ) -> Sequence[tuple[int, HullContact]]:
-        """Return the bodies that the hull meets at positions (nq,), once for each contact."""
+    def _ask(self, instant: Instant, positions: NDArray[np.float64]) -> _Asked:
+        """Ask the hull about bodies at positions (nq,), unless it was the last that was asked."""
         asked = self._asked
         if (
             asked is None
             or asked.instant is not instant
             or np.abs(asked.positions - positions).max() > _SAME_PLACE
         ):
-            found = tuple(
+            met = self._patches(instant.hull, positions)
+            contacts = tuple(
                 (body, contact)
-                for body, patches in self._patches(instant.hull, positions)
+                for body, patches in met
                 for contact in self._contacts_of(instant, body, patches)
             )
-            self._asked = asked = _Asked(instant, positions, found)
-        return asked.contacts
+            self._asked = asked = _Asked(instant, positions, bool(met), contacts)
+        return asked
 
     def _contacts_of(
         self, instant: Instant, body: int, patches: Sequence[Patch]
@@ -448,7 +452,7 @@ class Bodies:
             depths_m = np.concatenate([contact.depths_m for contact in own])
             arms = points_world - world.origin_world - there.center_local[body]
             approach, pull = (
-                ((linear + np.cross(angular, arms)) * normals).sum(axis=1)
+                ((linear + cross(angular, arms)) * normals).sum(axis=1)
                 for linear, angular in (
                     twist_of(world, there, rates, body) for rates in (free, gained)
                 )
@@ -471,8 +475,8 @@ class Bodies:
             turn = here.rotation[body] @ there.rotation[body].T
             points_local = here.center_local[body] + arms @ turn.T
             hits += [
-                _Hit(HullRow(body, *row, grips=is_squeezed), float(speed))
-                for *row, speed in zip(
+                _Hit(HullRow(body, point, normal, depth_m, after, is_squeezed), float(speed))
+                for point, normal, depth_m, after, speed in zip(
                     points_local,
                     normals,
                     depths_m,
@@ -492,11 +496,16 @@ class Bodies:
                 return
         patches = self._patches(hull, self._positions) if near_hull else []
         for _ in range(_MOST_MOVES):
-            own_m = own_depth(world, data, self._positions)
-            rows = self._rows_out(hull, patches)
-            if own_m <= 0 and all(row.depth_m <= 1.01 * SLOP_M for row in rows):
+            deepest_m = max(
+                (patch.deepest_m for _, found in patches for patch in found), default=0.0
+            )
+            rows = self._rows_out(hull, patches) if deepest_m > SLOP_M else []
+            is_out = all(row.depth_m <= 1.01 * SLOP_M for row in rows)
+            if own_depth(world, data, self._positions) <= 0 and is_out:
                 self._moved_out = (hull, self._positions) if near_hull else None
                 break
+            if not rows:
+                rows = self._rows_out(hull, patches)
             solved = solve_displacements(world, data, rows)
             before = self._energies()[1]
             self._positions = moved(world, self._positions, solved.change, 1.0)
@@ -508,8 +517,7 @@ class Bodies:
         for body, found in patches:
             books = self._books[body]
             for patch in found:
-                out_m = float(patch.out_m.max())
-                books.penetration_m = max(books.penetration_m, out_m)
+                books.penetration_m = max(books.penetration_m, patch.deepest_m)
 
     def _rows_out(self, hull: Hull, patches: Sequence[tuple[int, list[Patch]]]) -> list[HullRow]:
         """Return what moves bodies out of the hull; from between two hands, to their middle."""

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.effects.body_shape import cross
 from hybridve.hull.jit import compiled
 from hybridve.hull.query.engine import Hits, Triangles
 from hybridve.hull.query.silhouettes import Hull, Views
@@ -105,11 +106,19 @@ class Patch:
         How far each is from its exit along V_rec; infinite where none is within reach.
     v_rec : (3,) float64
         The recovery vector.
+    reach_m : float
+        How far an exit was looked for, metres.
     """
 
     points_world: NDArray[np.float64]
     out_m: NDArray[np.float64]
     v_rec: NDArray[np.float64]
+    reach_m: float
+
+    @property
+    def deepest_m(self) -> float:
+        """How deep it is along V_rec; the reach, where that is not known but at least as much."""
+        return min(float(self.out_m.max()), self.reach_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +182,7 @@ def find_patches(
     triangle, sample = hits.thinned(_MOST_POINTS)
     corners = mesh.corners_world[triangle]
     points_world = sample_positions(corners, mesh.viewports[triangle], sample.astype(np.uint32))
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     viewports = mesh.viewports[triangle].astype(np.float64)
     weighted = across / (viewports * (viewports + 1.0))[:, None]  # a sample's share of the area
     edges_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -228,7 +237,8 @@ def _squared(points: NDArray[np.float64], one: int, other: int) -> float:
     x = points[one, 0] - points[other, 0]
     y = points[one, 1] - points[other, 1]
     z = points[one, 2] - points[other, 2]
-    return x * x + y * y + z * z
+    squared: float = x * x + y * y + z * z
+    return squared
 
 
 def _patch(
@@ -252,7 +262,7 @@ def _patch(
         farthest = points_world[((points_world - center_world) ** 2).sum(axis=1).argmax()]
         v_rec = center_world - farthest
     if arc is not None:
-        tangent = np.cross(arc.axis, middle - arc.anchor_world)
+        tangent = cross(arc.axis, middle - arc.anchor_world)
         v_rec = tangent if tangent @ v_rec >= 0 else -tangent
     length = float(np.linalg.norm(v_rec))
     v_rec = v_rec / length if length > 0 else np.array([0.0, 0.0, 1.0])
@@ -264,7 +274,7 @@ def _patch(
         if other.max() < found.max():
             v_rec, found = -v_rec, other
     order = np.argsort(-np.where(np.isfinite(found), found, -1.0), kind="stable")
-    return Patch(chosen[order], found[order], v_rec)
+    return Patch(chosen[order], found[order], v_rec, reach_m)
 
 
 @compiled
@@ -394,9 +404,9 @@ def _surface_at(
     """Return the hull's surface where a point leaves it along V_rec after a way."""
     pixel_m = pixel_size(hull.views, point_world)
     radius_m = max(_FOOTPRINT_SHARE * size_m, _FOOTPRINT_PX * pixel_m)
-    side = np.cross(v_rec, np.eye(3)[np.abs(v_rec).argmin()])
+    side = cross(v_rec, np.eye(3)[np.abs(v_rec).argmin()])
     side /= np.linalg.norm(side)
-    frame = np.stack([side, np.cross(v_rec, side)])  # (2, 3)
+    frame = np.stack([side, cross(v_rec, side)])  # (2, 3)
     first, last, seconds = way
     moves = first is not None and first is not last and seconds > 0
     back_m = 2.0 * radius_m + (MOST_HULL_SPEED * seconds if moves else 0.0)
@@ -430,7 +440,7 @@ def pixel_size(views: Views, point_world: NDArray[np.float64]) -> float:
     """Return how large a pixel is at a point, metres: in the mean of the cameras before it."""
     matrices = views.img_from_local
     depths_m = matrices[:, 2, :3] @ (point_world - views.origin_world) + matrices[:, 2, 3]
-    focal_px = np.linalg.norm(np.cross(matrices[:, 0, :3], matrices[:, 2, :3]), axis=1)
+    focal_px = np.linalg.norm(cross(matrices[:, 0, :3], matrices[:, 2, :3]), axis=1)
     in_front = depths_m > 0
     return float((depths_m / focal_px)[in_front].mean()) if in_front.any() else 0.0
 
