@@ -306,8 +306,8 @@ def test_what_a_hull_swallows_falls_as_if_there_were_none() -> None:
     fallen_m = GRAVITY_M_S2 * (20 * STEP_S) ** 2 / 2
     assert played.column("ball", "position_m")[-1, 2] == pytest.approx(-fallen_m, abs=1e-9)
     assert played.column("ball", "n_contacts").max() == 0
-    # Twice the diagonal of its box.
-    assert played.column("ball", "penetration_m")[-1] == pytest.approx(2 * 3**0.5 * 0.1, rel=0.01)
+    # Twice the diagonal of its box, which the polyhedron fills but for a hundredth or two.
+    assert played.column("ball", "penetration_m")[-1] == pytest.approx(2 * 3**0.5 * 0.1, rel=0.03)
 
 
 def test_what_a_hull_lifts_out_is_work_of_the_hull() -> None:

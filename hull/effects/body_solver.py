@@ -32,7 +32,8 @@ from hybridve.hull.effects.body_model import World
 from hybridve.hull.effects.body_shape import cross
 from hybridve.hull.effects.effect import GRAVITY_M_S2
 
-#: What remains of MuJoCo's softness. A tonne on a gram sinks by less than a micrometre a second.
+#: What remains of MuJoCo's softness. A tonne on a gram sinks by a micrometre a second; of forces,
+#: which are rounding over the softness, six digits are left, and at a hundredth of this four.
 _SOFT = 1e-6
 
 #: The same of displacements, of which a hundredth may be left: of two hands that are not quite
