@@ -17,7 +17,7 @@ where it would, the step is solved without bouncing, and what were left is taken
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -28,14 +28,13 @@ from scipy.sparse.csgraph import connected_components
 
 from hybridve.hull.effects.body_model import (
     BodyPlan,
-    World,
     energies,
     make_world,
     places_of,
     start_of,
     twist_of,
 )
-from hybridve.hull.effects.body_shape import CollisionShape, cross
+from hybridve.hull.effects.body_shape import cross
 from hybridve.hull.effects.body_solver import (
     SLOP_M,
     HullRow,
@@ -47,10 +46,9 @@ from hybridve.hull.effects.body_solver import (
     solve_displacements,
     solve_velocities,
 )
+from hybridve.hull.effects.body_told import Books, pose_of, told_of
 from hybridve.hull.effects.effect import (
-    Drawn,
     Instant,
-    Quantity,
     Setting,
     Told,
     UnstableError,
@@ -88,76 +86,6 @@ _OFF_MIDDLE = 0.25
 
 #: A step that makes more energy than this share of the kinetic is solved again; less is rounding.
 _MADE = 1e-3
-
-_POSE = Quantity(
-    "world_from_mesh",
-    "m",
-    "exact",
-    "rotation and place of the mesh, of the simulated state",
-    (3, 4),
-)
-
-#: The arrows of the paper's figure 5, of the deepest contact since the frame before.
-_ARROWS = (
-    Quantity(
-        "cp_obj_m",
-        "m",
-        "sampled",
-        "CP_obj of the deepest contact since the frame before; NaN where there was none",
-        (3,),
-        is_place=True,
-    ),
-    Quantity("cp_hull_m", "m", "estimate", "CP_hull of that contact", (3,), is_place=True),
-    Quantity("v_rec", "1", "estimate", "V_rec of that contact, a unit vector", (3,)),
-    Quantity("n_hull", "1", "estimate", "N_hull of that contact, a unit vector", (3,)),
-)
-
-RIGID_COLUMNS = (
-    Quantity("position_m", "m", "exact", "centre of mass", (3,), is_place=True),
-    Quantity(
-        "orientation_wxyz",
-        "1",
-        "exact",
-        "how it has turned since it stood as the scene has it: a unit quaternion",
-        (4,),
-    ),
-    Quantity("velocity_m_s", "m/s", "exact", "of the centre of mass", (3,)),
-    Quantity("angular_velocity_rad_s", "rad/s", "exact", "in the world's frame", (3,)),
-    _POSE,
-    *_ARROWS,
-)
-
-HINGE_COLUMNS = (
-    Quantity("angle_rad", "rad", "exact", "from its place in the scene, about its axis"),
-    Quantity("angular_velocity_rad_s", "rad/s", "exact", "about its axis"),
-    _POSE,
-    *_ARROWS,
-)
-
-
-@dataclass(slots=True, eq=False)
-class _Books:
-    """What is told of one body, since the start or since the frame before."""
-
-    hull_work_j: float = 0.0
-    penetration_m: float = 0.0
-    n_contacts: int = 0
-    deepest_m: float = 0.0
-    arrows: NDArray[np.float64] = field(default_factory=lambda: np.full((4, 3), np.nan))
-
-    def meet(self, contact: HullContact) -> None:
-        """Count a contact."""
-        self.n_contacts += len(contact.points_world)
-        if contact.out_m > self.deepest_m:
-            self.deepest_m = contact.out_m
-            start = contact.points_world[0]
-            end = start + contact.out_m * contact.v_rec
-            self.arrows = np.stack([start, end, contact.v_rec, contact.n_hull])
-
-    def begin_frame(self) -> None:
-        """Count anew what is counted since the frame before."""
-        self.penetration_m, self.n_contacts, self.deepest_m = 0.0, 0, 0.0
-        self.arrows = np.full((4, 3), np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,10 +135,10 @@ class Bodies:
         self._scene_places = places_of(self._world, self._world.model.qpos0)
         self._positions, self._velocities = start_of(self._world)
         self._potential_at_start_j = self._energies()[1]
-        self._books = [_Books() for _ in plans]
+        self._books = [Books() for _ in plans]
         self._asked: _Asked | None = None
         self._moved_out: tuple[Hull, NDArray[np.float64]] | None = None
-        self.told = {plan.name: _told_of(self._world, plan) for plan in plans}
+        self.told = {plan.name: told_of(self._world, plan) for plan in plans}
 
     def advance(self, instant: Instant, step_s: float) -> None:
         """Go on by one step, to be out of the hull of this instant at its end."""
@@ -267,7 +195,7 @@ class Bodies:
                 "hull_work_j": np.asarray(books.hull_work_j),
                 "penetration_m": np.asarray(books.penetration_m),
                 "n_contacts": np.asarray(books.n_contacts, np.uint32),
-                **self._pose_of(body),
+                **pose_of(self._world, self._scene_places, self._positions, self._velocities, body),
                 **dict(
                     zip(("cp_obj_m", "cp_hull_m", "v_rec", "n_hull"), books.arrows, strict=True)
                 ),
@@ -295,7 +223,7 @@ class Bodies:
         self._positions = np.array(state["positions"], np.float64)
         self._velocities = np.array(state["velocities"], np.float64)
         self._books = [
-            _Books(float(work_j), float(penetration_m), int(count), float(deepest_m), arrows.copy())
+            Books(float(work_j), float(penetration_m), int(count), float(deepest_m), arrows.copy())
             for work_j, penetration_m, count, deepest_m, arrows in zip(
                 state["hull_work_j"],
                 state["penetration_m"],
@@ -563,32 +491,6 @@ class Bodies:
         touched = label[world.body_id[[row.body for row in rows]]]
         return np.flatnonzero(np.isin(label[world.body_id], touched))
 
-    def _pose_of(self, body: int) -> dict[str, NDArray[Any]]:
-        world = self._world
-        plan, places = world.plans[body], places_of(world, self._positions)
-        rotation = places.rotation[body] @ self._scene_places.rotation[body].T
-        center_world = places.center_local[body] + world.origin_world
-        shift = center_world - rotation @ plan.share.center
-        mesh = plan.scene_object.world_from_mesh
-        pose = np.column_stack([rotation @ mesh[:, :3], rotation @ mesh[:, 3] + shift])
-        dof = int(world.dof_at[body])
-        if plan.hinge is not None:
-            return {
-                "angle_rad": np.asarray(self._positions[world.qpos_at[body]]),
-                "angular_velocity_rad_s": np.asarray(self._velocities[dof]),
-                "world_from_mesh": pose,
-            }
-        orientation = np.zeros(4)
-        mujoco.mju_mat2Quat(orientation, np.ascontiguousarray(rotation).ravel())
-        linear, angular = twist_of(world, places, self._velocities, body)
-        return {
-            "position_m": center_world,
-            "orientation_wxyz": orientation,
-            "velocity_m_s": linear.copy(),
-            "angular_velocity_rad_s": angular,
-            "world_from_mesh": pose,
-        }
-
 
 def _calmed(hit: _Hit, *, stands: bool) -> _Hit:
     """Return what a contact asks for if bodies do not bounce, or if the hull stands as well."""
@@ -608,46 +510,3 @@ def _surface_of(plan: BodyPlan, viewport: int) -> _Surface:
         float(np.linalg.norm(used - plan.share.center, axis=1).max()),
         float(np.linalg.norm(np.ptp(used, axis=0))),
     )
-
-
-def _told_of(world: World, plan: BodyPlan) -> Told:
-    scene_object, share = plan.scene_object, plan.share
-    shape = world.shapes[scene_object.name]
-    is_closed = scene_object.is_closed
-    about = {
-        "object": scene_object.name,
-        "mass_kg": plan.mass_kg,
-        "mass_lies_in": "its volume" if is_closed else "its area, for its surface is open",
-        "volume_m3": abs(share.volume_m3) if is_closed else None,
-        "center_of_mass_m": share.center.tolist(),
-        "moments_of_inertia_kg_m2": (plan.mass_kg * share.inertia_m2).tolist(),
-        "collides_with_the_hull_as": "its mesh",
-        "collides_with_bodies_and_cad_as": _shape_in_words(shape),
-        "outside_its_mesh_by_at_most_m": shape.outside_m,
-        "cad_collides_as": {
-            name: _shape_in_words(one)
-            for name, one in world.shapes.items()
-            if name not in {other.scene_object.name for other in world.plans}
-        },
-        "friction_along_the_hull": "as if its surface stood: silhouettes do not show it slide",
-        "does_not_meet": [other for name, other in world.unmet if name == plan.name],
-    }
-    mesh = scene_object.vertices_mesh
-    return Told(
-        columns=RIGID_COLUMNS if plan.hinge is None else HINGE_COLUMNS,
-        drawn=Drawn(
-            "world_from_mesh",
-            scene_object.vertices_world if mesh is None else mesh,
-            scene_object.faces,
-        ),
-        about=about,
-    )
-
-
-def _shape_in_words(shape: CollisionShape) -> str:
-    words = []
-    if shape.n_convex:
-        words.append(f"{shape.n_convex} convex part{'s' if shape.n_convex > 1 else ''} of its mesh")
-    if shape.n_prisms:
-        words.append(f"{shape.n_prisms} triangles {1000 * shape.prism_m:.1f} mm thick")
-    return " and ".join(words)
