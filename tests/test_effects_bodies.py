@@ -458,7 +458,9 @@ def test_two_hands_are_two_patches_and_each_pushes_its_way() -> None:
     is_squeezed, speeds = followed(normals, np.array([0.3, 0.1]))
     assert is_squeezed
     np.testing.assert_allclose(speeds, [0.1, -0.1])  # the one velocity between both: 0.1 upwards
-    assert followed(normals[:1], np.array([0.3])) == (False, 0.3)
+    is_squeezed, speeds = followed(normals[:1], np.array([0.3]))
+    assert not is_squeezed
+    np.testing.assert_array_equal(speeds, 0.3)
 
 
 def test_what_pierces_a_body_leaves_where_it_came_in() -> None:
