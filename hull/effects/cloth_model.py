@@ -337,13 +337,13 @@ def move_freely(
         How many.
     """
     force = np.zeros_like(x)
-    kept = np.exp(-drag_per_s * step_s)
+    kept = np.exp(-0.5 * drag_per_s * step_s)  # half before a step, half after it
     _forces(x, v, springs, damping_s, force)
     for _ in range(n_steps):
         for i in range(len(x)):
             if inverse_mass[i] > 0.0:
                 for k in range(3):
-                    v[i, k] += 0.5 * step_s * inverse_mass[i] * force[i, k]
+                    v[i, k] = kept * v[i, k] + 0.5 * step_s * inverse_mass[i] * force[i, k]
                 v[i, 2] -= 0.5 * step_s * gravity
                 for k in range(3):
                     x[i, k] += step_s * v[i, k]

@@ -23,10 +23,10 @@ Samples that hang on pinned nodes by more than half cannot follow: they are held
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.jit import ZERO, compiled
+from hybridve.hull.jit import ZERO, compiled, inlined
 from hybridve.hull.query.frame import Frame
 from hybridve.hull.query.points import is_inside, project
-from hybridve.hull.query.silhouettes import BACKGROUND, OBJECT
+from hybridve.hull.query.silhouettes import BACKGROUND
 
 #: Along its way a sample is looked at in steps of this length, then halved to that of the second:
 #: gaps of the hull that are narrower than the first are no way out. Metres.
@@ -132,18 +132,34 @@ def _way_in(
     return inside_m
 
 
-@compiled
-def _answer(frame: Frame, camera: int, column: int, row: int) -> int:
-    """Return what a camera says at a pixel; beyond its image, background unless it abstains."""
-    width, height = frame.sizes[camera]
+@inlined
+def _is_object(
+    answers: NDArray[np.uint8], image: tuple[int, int, int, bool], column: int, row: int
+) -> bool:
+    """Tell whether a camera sees no background at a pixel; beyond its image if it abstains.
+
+    Its image begins at the first of `image` in the answers, then come width, height, and whether it
+    abstains.
+    """
+    first, width, height, keep = image
     if 0 <= column < width and 0 <= row < height:
-        return int(frame.answers[frame.mask_offset[camera] + row * width + column])
-    return OBJECT if frame.keep else BACKGROUND
+        return bool(answers[first + row * width + column] != BACKGROUND)
+    return keep
+
+
+@inlined
+def _image_of(frame: Frame, camera: int) -> tuple[int, int, int, bool]:
+    sizes = frame.sizes
+    return frame.mask_offset[camera], sizes[camera, 0], sizes[camera, 1], frame.keep
 
 
 @compiled
 def _nearest_background(
-    frame: Frame, camera: int, x: float, y: float, limit_px: float
+    answers: NDArray[np.uint8],
+    image: tuple[int, int, int, bool],
+    x: float,
+    y: float,
+    limit_px: float,
 ) -> tuple[float, float, float]:
     """Return how far the nearest background of a camera is from a pixel, and the way to it.
 
@@ -157,7 +173,7 @@ def _nearest_background(
             is_end = dy == -ring or dy == ring
             dx = -ring
             while dx <= ring:
-                if _answer(frame, camera, column + dx, row + dy) == BACKGROUND:
+                if not _is_object(answers, image, column + dx, row + dy):
                     left, top = float(column + dx), float(row + dy)
                     to_x = min(max(x, left), left + 1.0) - x
                     to_y = min(max(y, top), top + 1.0) - y
@@ -170,7 +186,9 @@ def _nearest_background(
 
 
 @compiled
-def _outline_normal(frame: Frame, camera: int, x: float, y: float) -> tuple[float, float]:
+def _outline_normal(
+    answers: NDArray[np.uint8], image: tuple[int, int, int, bool], x: float, y: float
+) -> tuple[float, float]:
     """Return the direction of an outline at a pixel, from object to background; (0, 0) for none.
 
     That of `hybridve.hull.query.walk.silhouette_normal`: the first moment of a window.
@@ -187,7 +205,7 @@ def _outline_normal(frame: Frame, camera: int, x: float, y: float) -> tuple[floa
             all_x += weight * at_x
             all_y += weight * at_y
             whole += weight
-            if _answer(frame, camera, column + dx, row + dy) == OBJECT:
+            if _is_object(answers, image, column + dx, row + dy):
                 moment_x += weight * at_x
                 moment_y += weight * at_y
                 total += weight
@@ -211,18 +229,17 @@ def _cone_way(
 
     Infinity if the camera does not see the point, or its outline is beyond the limit.
     """
-    m = frame.matrices[camera]
+    m, image = frame.matrices[camera], _image_of(frame, camera)
     depth_m, x, y = project(point[0], point[1], point[2], m)
-    width, height = frame.sizes[camera]
-    if not (depth_m > 0.0 and 0.0 <= x < width and 0.0 <= y < height):
+    if not (depth_m > 0.0 and 0.0 <= x < image[1] and 0.0 <= y < image[2]):
         return np.inf
     focal_px = np.sqrt((m[0] - x * m[8]) ** 2 + (m[1] - x * m[9]) ** 2 + (m[2] - x * m[10]) ** 2)
     limit_px = min(limit_m * focal_px / depth_m + 2.0, 1.0 * _SEARCH_PX)
-    apart, to_x, to_y = _nearest_background(frame, camera, x, y, limit_px)
+    apart, to_x, to_y = _nearest_background(frame.answers, image, x, y, limit_px)
     if not apart <= limit_px:
         return np.inf
     q_x, q_y = x + to_x, y + to_y
-    n_x, n_y = _outline_normal(frame, camera, q_x, q_y)
+    n_x, n_y = _outline_normal(frame.answers, image, q_x, q_y)
     forward = n_x * to_x + n_y * to_y
     if forward <= 0.5 * apart:  # a corner of the outline, or a hair of it
         if apart == 0.0:
@@ -243,29 +260,41 @@ def _shortest_way(
     point: NDArray[np.float64],
     side: NDArray[np.float64],
     frame: Frame,
+    first: int,
     direction: NDArray[np.float64],
-) -> None:
-    """Write the direction of the shortest way out of all cameras' outlines, by where it was."""
-    best_m, kept_m = _REACH_M, np.inf
-    tried, kept = np.zeros(3), np.zeros(3)
+) -> int:
+    """Write the direction of the shortest way out of all cameras' outlines; return whose it is.
+
+    Cameras are asked from `first` on: the one that ends the hull at a neighbour ends the search of
+    the others. Where the shortest leads against `side`, one that does not is taken if there is any
+    that is not much longer. -1, and zeros, where there is none.
+    """
+    n_cameras = len(frame.sizes)
+    best, best_m = -1, _REACH_M
+    tried = np.zeros(3)
     direction[:] = 0.0
-    has_side = side[0] != 0.0 or side[1] != 0.0 or side[2] != 0.0
-    for camera in range(len(frame.sizes)):
-        limit_m = best_m + _SIDE_WORTH_M if has_side else best_m
-        length_m = _cone_way(point, frame, camera, limit_m, tried)
+    for number in range(n_cameras):
+        camera = (first + number) % n_cameras
+        length_m = _cone_way(point, frame, camera, best_m, tried)
         if length_m < best_m:
-            best_m = length_m
+            best, best_m = camera, length_m
             direction[:] = tried
+    if best < 0 or direction[0] * side[0] + direction[1] * side[1] + direction[2] * side[2] >= 0.0:
+        return best
+    kept_m = best_m + _SIDE_WORTH_M
+    for camera in range(n_cameras):
+        length_m = _cone_way(point, frame, camera, kept_m, tried)
         along = tried[0] * side[0] + tried[1] * side[1] + tried[2] * side[2]
-        if length_m < kept_m and along > 0.0:  # never where there is no side
-            kept_m = length_m
-            kept[:] = tried
-    if kept_m <= best_m + _SIDE_WORTH_M:
-        direction[:] = kept
+        if length_m < kept_m and along > 0.0:
+            best, kept_m = camera, length_m
+            direction[:] = tried
+    return best
 
 
 @compiled
-def _share_of_window(frame: Frame, camera: int, x: float, y: float) -> float:
+def _share_of_window(
+    answers: NDArray[np.uint8], image: tuple[int, int, int, bool], x: float, y: float
+) -> float:
     """Return the object's weight in a window about a pixel, in pixels along its radius.
 
     A straight outline through the pixel that moves by so much changes it by that.
@@ -276,7 +305,7 @@ def _share_of_window(frame: Frame, camera: int, x: float, y: float) -> float:
         for dx in range(-_WINDOW_PX - 1, _WINDOW_PX + 2):
             at_x, at_y = column + dx + 0.5 - x, row + dy + 0.5 - y
             weight = 1.0 - (at_x * at_x + at_y * at_y) / _WINDOW_PX**2
-            if weight > 0.0 and _answer(frame, camera, column + dx, row + dy) == OBJECT:
+            if weight > 0.0 and _is_object(answers, image, column + dx, row + dy):
                 total += weight
     return total / (4.0 / 3.0 * _WINDOW_PX)
 
@@ -290,14 +319,13 @@ def _advance_of_outline(
     `end` is just out of the hull, local frame.
     """
     for camera in range(len(frame.sizes)):
-        m = frame.matrices[camera]
+        m, image = frame.matrices[camera], _image_of(frame, camera)
         depth_m, x, y = project(end[0], end[1], end[2], m)
-        width, height = frame.sizes[camera]
-        if not (depth_m > 0.0 and 0.0 <= x < width and 0.0 <= y < height):
+        if not (depth_m > 0.0 and 0.0 <= x < image[1] and 0.0 <= y < image[2]):
             continue
-        if _answer(frame, camera, int(x), int(y)) != BACKGROUND:
+        if _is_object(frame.answers, image, int(x), int(y)):
             continue
-        n_x, n_y = _outline_normal(frame, camera, x, y)
+        n_x, n_y = _outline_normal(frame.answers, image, x, y)
         along = 0.0  # how many pixels a metre of the way is across the outline
         for k in range(3):
             component = n_x * m[k] + n_y * m[4 + k] - (n_x * x + n_y * y) * m[8 + k]
@@ -311,8 +339,9 @@ def _advance_of_outline(
         then_depth_m, then_x, then_y = project(end[0], end[1], end[2], before.matrices[then])
         if not then_depth_m > 0.0:
             continue
-        moved_px = _share_of_window(frame, camera, x, y)
-        moved_px -= _share_of_window(before, then, then_x, then_y)
+        moved_px = _share_of_window(frame.answers, image, x, y)
+        image_then = _image_of(before, then)
+        moved_px -= _share_of_window(before.answers, image_then, then_x, then_y)
         if np.abs(moved_px) < _TOLD_PX:
             return moved_px / along
     return np.nan
@@ -426,7 +455,7 @@ def push_hits(
     depth_m = np.zeros(count)
     point, about = np.zeros(3), np.zeros(3)
     is_constrained = constrained[0] != 0.0 or constrained[1] != 0.0 or constrained[2] != 0.0
-    n_held = ZERO
+    n_held, first = ZERO, ZERO
     deepest_m = 0.0
     for k in range(count):
         t = triangle[k]
@@ -457,9 +486,11 @@ def push_hits(
         if is_constrained:
             ways[k] = constrained
         else:
-            _shortest_way(point, about, frame, ways[k])
-            if ways[k, 0] == 0.0 and ways[k, 1] == 0.0 and ways[k, 2] == 0.0:
-                ways[k, 2] = 1.0  # cameras that all abstain: up, as good as any
+            camera = _shortest_way(point, about, frame, first, ways[k])
+            if camera >= 0:
+                first = camera
+            else:
+                ways[k, 2] = 1.0  # no outline is near: up, as good as any
         depth_m[k] = way_out(point, ways[k], frame, _REACH_M)
         if depth_m[k] < 0.0:
             depth_m[k] = _REACH_M

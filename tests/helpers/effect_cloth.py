@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from helpers.hulls import look_at, projection, ring_views
 from hybridve.hull.cad.scene import Scene, SceneObject
 from hybridve.hull.cad.topology import examine_topology
 from hybridve.hull.effects.cloth import KIND, Cloths
 from hybridve.hull.effects.effect import Entry, Instant, Setting
 from hybridve.hull.query.engine import Engine, Triangles
 from hybridve.hull.query.native import Native
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
 from hybridve.hull.query.viewport import sample_positions
+from hybridve.hull.query.walk import contains_few, spans_of_rays
 from hybridve.hull.synth.meshes import sheet_mesh
 
 STEP_S = 0.002
@@ -79,6 +81,55 @@ def make_cloth(
     effect = KIND.make([Entry("sheet", table, "scene.toml: effect.1")], setting)
     assert isinstance(effect, Cloths)
     return effect
+
+
+def views_around() -> Views:
+    """Return four cameras of 640 x 480 about the origin: a pixel is some 3.7 mm wide there."""
+    return ring_views(4, 640, 480, 600.0, 2.0)
+
+
+def half_space_views() -> Views:
+    """Return a camera above that looks down, and one at the side: a pixel is 2.5 mm wide."""
+    eyes = np.array([[0.0, 0.0, 2.0], [2.0, 0.0, 0.0]])
+    matrices = [projection(look_at(eye, np.zeros(3)), 800.0, 640, 640) for eye in eyes]
+    return make_views(("above", "side"), np.array([[640, 640]] * 2), np.array(matrices))
+
+
+def half_space(views: Views, y_m: float, band_m: float) -> Hull:
+    """Return all below a plane, for |z| up to about `band_m`, of `half_space_views`.
+
+    The plane goes through the camera above and, at z = 0, through y = `y_m`.
+    """
+    masks = []
+    for camera in range(2):
+        width, height = views.sizes_px[camera].tolist()
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+        matrix = views.img_from_local[camera]
+        rays = pixels @ np.linalg.inv(matrix[:, :3]).T
+        center = views.origin_world + views.centers_local()[camera]
+        # To the plane z = 0 from above, to x = 0 from the side.
+        axis = 2 if camera == 0 else 0
+        hit = center - rays * (center[axis] / rays[..., axis])[..., None]
+        inside = hit[..., 1] < y_m if camera == 0 else np.abs(hit[..., 2]) < band_m
+        masks.append(inside.astype(np.uint8))
+    return make_hull(views, masks)
+
+
+def deepest_m(hull: Hull, thing: SceneObject, vertices_m: NDArray[np.float64]) -> float:
+    """Return how far the sample deepest in the hull is from the nearest way out of many, metres."""
+    samples = samples_world(thing, vertices_m)
+    inside = samples[contains_few(hull, samples)]
+    if len(inside) == 0:
+        return 0.0
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)
+    ways = grid[np.abs(grid).max(axis=1) == 1.0]
+    origins, directions = np.repeat(inside, len(ways), axis=0), np.tile(ways, (len(inside), 1))
+    out_m = np.zeros(len(origins))
+    for number, spans in enumerate(spans_of_rays(hull, origins, directions, 1.0)):
+        if len(spans) and spans[0, 0] < 1e-6:  # a sample on the rim may begin with a gap
+            out_m[number] = spans[0, 1]
+    return float(out_m.reshape(len(inside), -1).min(axis=1).max())
 
 
 def no_hull(views: Views) -> Hull:
