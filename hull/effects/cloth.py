@@ -1,9 +1,10 @@
 """The effect "cloth": a sheet of the scene hangs, swings, and is pushed aside by real things.
 
-What a sheet is made of and how it moves stands in `hybridve.hull.effects.cloth_model`. After each
-step it is moved off the CAD that no effect moves (`hybridve.hull.effects.keep_off`), and out of the
-hull (`hybridve.hull.effects.push_out`): all samples of all its triangles are volume-queried, those
-inside moved out, and asked again, until none is deeper than `_LEFT_M`. The hull has the last word.
+What a sheet is made of and how it moves stands in `hybridve.hull.effects.cloth_model`. It leans on
+the CAD that no effect moves (`hybridve.hull.effects.keep_off`) and, where it did before, on the
+hull. After each step it is moved out of the hull (`hybridve.hull.effects.push_out`): all samples of
+all its triangles are volume-queried, those inside moved out, and asked again, until none is deeper
+than `_LEFT_M`. The hull has the last word.
 
 A sheet does not feel itself.
 """
@@ -17,12 +18,15 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from hybridve.hull.effects.cloth_model import (
+    Contacts,
     Welded,
     highest_frequency,
+    joined_contacts,
     kinetic_of,
     longest_step,
     make_springs,
-    move_freely,
+    move_on,
+    no_contacts,
     node_masses,
     potential_of,
     triangle_areas,
@@ -42,7 +46,7 @@ from hybridve.hull.effects.effect import (
     UnstableError,
 )
 from hybridve.hull.effects.keep_off import Obstacle
-from hybridve.hull.effects.push_out import LEAST_FREE, may_meet, push_hits, touch
+from hybridve.hull.effects.push_out import LEAST_FREE, may_meet, push_hits, renew, touch
 from hybridve.hull.query.clusters import spatial_order
 from hybridve.hull.query.engine import Triangles
 from hybridve.hull.query.silhouettes import Hull
@@ -56,6 +60,9 @@ _BY_WEIGHT, _WHOLE, _ONE_WAY = 6, 6, 200
 
 #: No real thing is faster, metres a second; and none is looked for farther back, metres.
 _FASTEST_M_S, _FARTHEST_M = 10.0, 0.3
+
+#: CAD is felt by what may come nearer to it in a step than this beyond what it goes, metres.
+_NEAR_M = 1e-3
 
 #: A node remembers for so long on which side of a real thing it was, seconds.
 _REMEMBERED_S = 0.1
@@ -222,6 +229,8 @@ class _Sheet:
             "velocities": np.zeros_like(nodes),
             "side": np.zeros_like(nodes),
             "side_age_s": np.zeros(len(nodes)),
+            "contact_sample": np.full((len(faces), 3), -1, np.int64),
+            "contact_way": np.zeros((len(faces), 3, 3)),
             "hull_work_j": np.zeros(1),
             "penetration_m": np.zeros(1),
             "n_contacts": np.zeros(1, np.int64),
@@ -248,8 +257,9 @@ class _Sheet:
                     "n_held",
                     "1",
                     "sampled",
-                    "samples in the hull after the last step that hang on pinned nodes by more "
-                    f"than {1 - LEAST_FREE:g} and stay there; penetration_m leaves them out",
+                    "samples in the hull after the last step that stay there, as a pinned corner "
+                    f"of their triangle is in it, or more than {1 - LEAST_FREE:g} of their weight "
+                    "is on pinned corners; penetration_m leaves them out",
                     dtype=np.uint32,
                 ),
             ),
@@ -300,8 +310,13 @@ class _Sheet:
         """Go on by one step."""
         x, v, age_s = (self.state[key] for key in ("nodes_world", "velocities", "side_age_s"))
         before, before_j = x.copy(), sum(self._energies())
+        state = self.state
+        near_m = 2.0 * step_s * float(np.sqrt((v * v).sum(axis=1).max())) + _NEAR_M
+        in_hull = self._contacts_in_hull(instant)
+        others = [obstacle.contacts(x, near_m) for obstacle in self._obstacles]
         n_steps = self._n_steps(step_s)
-        move_freely(
+        is_held = np.zeros(len(x), np.bool_)
+        lost_j, others_j = move_on(
             x,
             v,
             self._inverse_mass,
@@ -311,13 +326,34 @@ class _Sheet:
             self._inner_s,
             step_s / n_steps,
             n_steps,
+            joined_contacts([in_hull, *others]),
+            len(in_hull.level_m),
+            self._friction,
+            is_held,
         )
-        free_j = sum(self._energies())
-        self._refuse_growth(before_j, free_j, instant)
+        has_contacts = len(in_hull.level_m) > 0 or any(len(one.level_m) > 0 for one in others)
+        if not has_contacts:
+            self._refuse_growth(before_j, sum(self._energies()), instant)
         age_s += step_s
-        self.state["side"][age_s > _REMEMBERED_S] = 0.0
-        self._keep_off(before)
-        self._get_out(before, instant)
+        age_s[is_held] = 0.0
+        state["side"][age_s > _REMEMBERED_S] = 0.0
+        is_pushed = self._get_out(before, instant)
+        touched = is_held | is_pushed
+        gain_j = sum(self._energies()) - before_j
+        if not np.isfinite(gain_j):
+            raise UnstableError(
+                f"cloth {self._entry.name!r} at {instant.time_s:.3f} s: a node is not at a finite "
+                "place"
+            )
+        is_still = instant.before is instant.hull or not touched.any()
+        if is_still and (has_contacts or touched.any()):
+            gain_j -= self._take_back(gain_j, touched)
+        if touched.any():
+            # The balance: what it has more, and what was lost, came from the hull. What stands
+            # still only takes; what drag and damping take of trembling, it did not give.
+            work_j = gain_j + lost_j - others_j
+            state["hull_work_j"] += min(work_j, max(gain_j, 0.0)) if is_still else work_j
+        state["n_contacts"] += int(touched.sum())
 
     def _n_steps(self, step_s: float) -> int:
         return max(1, int(np.ceil(step_s / self._longest_s)))
@@ -329,51 +365,50 @@ class _Sheet:
         return kinetic_of(v, self._masses), potential_j
 
     def _refuse_growth(self, before_j: float, after_j: float, instant: Instant) -> None:
-        if not np.isfinite(after_j):
-            raise UnstableError(
-                f"cloth {self._entry.name!r} at {instant.time_s:.3f} s: a node is not at a finite "
-                "place"
-            )
+        """Stop where free motion brings energy: it can take no more than it errs by."""
         kinetic_j, potential_j = self._energies()
         weight_j = GRAVITY_M_S2 * float(self._masses @ self.state["nodes_world"][:, 2])
         moving_j = kinetic_j + potential_j - weight_j
-        if after_j - before_j > _GROWTH * moving_j + 1e-12:
+        if not after_j - before_j <= _GROWTH * moving_j + 1e-12:
             raise UnstableError(
                 f"cloth {self._entry.name!r} at {instant.time_s:.3f} s: one step of free motion "
                 f"brought {after_j - before_j:.3g} J, of {moving_j:.3g} J of motion and springs"
             )
 
-    def _keep_off(self, before: NDArray[np.float64]) -> None:
-        """Move the nodes off the CAD that stands."""
-        x, v = self.state["nodes_world"], self.state["velocities"]
-        for obstacle in self._obstacles:
-            shift = np.zeros((len(x), 4))
-            free_j = sum(self._energies())
-            if not obstacle.push(x, self._inverse_mass, shift):
-                continue
-            obstacle.push(x, self._inverse_mass, shift)
-            nothing, side = np.zeros((len(x), 2)), np.zeros_like(x)
-            touch(x, v, before, self._inverse_mass, shift, nothing, self._friction, side)
-            self._take_back(sum(self._energies()) - free_j, shift[:, 3] > 0)
+    def _contacts_in_hull(self, instant: Instant) -> Contacts:
+        """Return where the sheet leaned on the hull, as that is now."""
+        sample = self.state["contact_sample"]
+        if not (sample >= 0).any():
+            return no_contacts()
+        before, elapsed_s = _known_before(instant)
+        return Contacts(
+            *renew(
+                self.state["nodes_world"],
+                -instant.hull.views.origin_world,
+                self._triangles.faces,
+                self._triangles.viewports,
+                instant.hull.frame,
+                before.frame,
+                elapsed_s,
+                sample,
+                self.state["contact_way"],
+            )
+        )
 
-    def _get_out(self, start: NDArray[np.float64], instant: Instant) -> None:
-        """Move the samples out of the hull."""
+    def _get_out(self, start: NDArray[np.float64], instant: Instant) -> NDArray[np.bool_]:
+        """Move the samples out of the hull; return which nodes (N,) that moves."""
         state = self.state
+        moved = np.zeros(len(start), np.bool_)
         state["n_held"][:] = 0
         hits = self._hits(instant.hull)
         if hits is None:
-            return
+            return moved
         x, v = state["nodes_world"], state["velocities"]
-        before_j = sum(self._energies())
-        is_still = instant.before is instant.hull
-        hull_before, elapsed_s = instant.hull, 0.0
-        if instant.before is not None and not is_still:
-            hull_before, elapsed_s = instant.before, instant.elapsed_s
+        hull_before, elapsed_s = _known_before(instant)
         origin = -instant.hull.views.origin_world
         reach_m = min(_FASTEST_M_S * elapsed_s, _FARTHEST_M)
         frame, frame_before = instant.hull.frame, hull_before.frame
         shift, speed = np.zeros((len(x), 4)), np.zeros((len(x), 2))
-        moved = np.zeros(len(x), np.bool_)
         constrained, depth_m = self._constrained, 0.0
         for turn in range(_BY_WEIGHT + _WHOLE + _ONE_WAY):
             if turn == _BY_WEIGHT + _WHOLE and not constrained.any():
@@ -393,6 +428,8 @@ class _Sheet:
                 state["side"],
                 shift,
                 speed,
+                state["contact_sample"],
+                state["contact_way"],
                 0.0 if turn == 0 else _LEFT_M,
                 turn >= _BY_WEIGHT,
             )
@@ -413,12 +450,8 @@ class _Sheet:
         touch(x, v, x, self._inverse_mass, shift, speed, 0.0, state["side"])
         moved |= shift[:, 3] > 0
         state["side_age_s"][moved] = 0.0
-        state["n_contacts"] += int(moved.sum())
         state["penetration_m"][:] = max(float(state["penetration_m"][0]), depth_m)
-        gain_j = sum(self._energies()) - before_j
-        if is_still:
-            gain_j -= self._take_back(gain_j, moved)
-        state["hull_work_j"] += gain_j
+        return moved
 
     def _hits(self, hull: Hull) -> tuple[NDArray[np.uint32], NDArray[np.uint32]] | None:
         """Return triangle and number of the samples in the hull; None if there are none."""
@@ -443,6 +476,16 @@ class _Sheet:
             v[some] *= np.sqrt(1.0 - take_j / kinetic_j)
             taken_j += take_j
         return taken_j
+
+
+def _known_before(instant: Instant) -> tuple[Hull, float]:
+    """Return the hull before and the seconds since; 0 where nothing is known of the hull's speed.
+
+    Or where it stands still.
+    """
+    if instant.before is None or instant.before is instant.hull:
+        return instant.hull, 0.0
+    return instant.before, instant.elapsed_s
 
 
 def _main_way(shift: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,10 +13,16 @@ The stiffness of a spring is k = E sum(A) / l^2 over the triangles of its edge, 
 Approximate simulation of elastic membranes by triangulated spring meshes (1998).
 
 Time goes on by kick, drift, kick (velocity Verlet): energy without damping neither grows nor
-decays, and free fall is exact. It is stable for steps below 2 / w with w the angular frequency of
-the stiffest mode, which `highest_frequency` bounds.
+decays, and free fall is exact. What the sheet leans on holds it within every one of these steps:
+held once for several of them, a node that is pulled at would run, and be set back against springs
+that have shed their tension as waves, for ever. Places are set right after the drift, speeds after
+the last kick, so that what rests on something neither gains nor loses.
+
+It is stable for steps below 2 / w with w the angular frequency of the stiffest mode, which
+`highest_frequency` bounds.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.topology import places_of
-from hybridve.hull.jit import compiled
+from hybridve.hull.jit import ZERO, compiled
 
 #: What a step may use of the limit 2 / w: damping and compressed springs need the rest.
 _SHARE = 0.8
@@ -214,7 +220,7 @@ def highest_frequency(springs: Springs, inverse_mass: NDArray[np.float64]) -> fl
 
 
 def longest_step(frequency: float, damping_s: float) -> float:
-    """Return the longest stable step, seconds; `damping_s` is that of `move_freely`.
+    """Return the longest stable step, seconds; `damping_s` is that of `move_on`.
 
     The largest root of h^2 w^2 + 2 h d w^2 = 4, and a margin.
     """
@@ -262,9 +268,13 @@ def _forces(
     springs: Springs,
     damping_s: float,
     force: NDArray[np.float64],
-) -> None:
-    """Write the forces (N, 3) of springs and bends on the nodes, with their damping."""
+) -> float:
+    """Write the forces (N, 3) of springs and bends on the nodes, with their damping.
+
+    Return the power that the damping takes, watts.
+    """
     force[:] = 0.0
+    power = 0.0
     for e in range(len(springs.ends)):
         i, j = springs.ends[e]
         dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
@@ -274,6 +284,7 @@ def _forces(
         rate = (
             dx * (v[i, 0] - v[j, 0]) + dy * (v[i, 1] - v[j, 1]) + dz * (v[i, 2] - v[j, 2])
         ) / length
+        power += springs.stiffness[e] * damping_s * rate * rate
         pull = springs.stiffness[e] * (length - springs.length_m[e] + damping_s * rate) / length
         force[i, 0] -= pull * dx
         force[i, 1] -= pull * dy
@@ -295,16 +306,182 @@ def _forces(
         if turn == 0.0:
             continue
         rate = (tx * ux + ty * uy + tz * uz) / turn
+        power += springs.resistance[b] * damping_s * rate * rate
         pull = springs.resistance[b] * (turn - springs.turn_m[b] + damping_s * rate) / turn
         for n in range(4):
             at, weight = springs.hinges[b, n], springs.weights[b, n]
             force[at, 0] -= pull * weight * tx
             force[at, 1] -= pull * weight * ty
             force[at, 2] -= pull * weight * tz
+    return power
+
+
+class Contacts(NamedTuple):
+    """What samples of a sheet may not go below, as compiled loops take it.
+
+    Attributes
+    ----------
+    corners : (K, 3) int64
+        The nodes of each sample.
+    weights : (K, 3) float64
+        Its weights.
+    way : (K, 3) float64
+        Unit vectors; what is below is against them.
+    level_m : (K,) float64
+        What the way's coordinate may not be below at the end of the step, world.
+    rise_m : (K,) float64
+        How much lower that is at its beginning.
+    speed : (K,) float64
+        With which what is below comes along the way, metres a second.
+    """
+
+    corners: NDArray[np.int64]
+    weights: NDArray[np.float64]
+    way: NDArray[np.float64]
+    level_m: NDArray[np.float64]
+    rise_m: NDArray[np.float64]
+    speed: NDArray[np.float64]
+
+
+def no_contacts() -> Contacts:
+    """Return none."""
+    none = np.zeros((0, 3))
+    return Contacts(none.astype(np.int64), none, none, none[:, 0], none[:, 0], none[:, 0])
+
+
+def joined_contacts(some: Sequence[Contacts]) -> Contacts:
+    """Return the contacts of several as one."""
+    return Contacts(
+        *(np.ascontiguousarray(np.concatenate(each)) for each in zip(*some, strict=True))
+    )
 
 
 @compiled
-def move_freely(
+def _lift(
+    x: NDArray[np.float64],
+    x_before: NDArray[np.float64],
+    inverse_mass: NDArray[np.float64],
+    contacts: Contacts,
+    first: int,
+    last: int,
+    left: float,
+    friction: float,
+    is_active: NDArray[np.bool_],
+) -> None:
+    """Lift samples that are below what they lean on, in place, and mark these contacts.
+
+    Contacts `first` to `last`; `left` is the share of the step that is to come. Friction takes of
+    the path across the way as much as `friction` times the lift.
+    """
+    slip = np.zeros(3)
+    for c in range(first, last):
+        way = contacts.way[c]
+        total, at_m = 0.0, 0.0
+        for n in range(3):
+            node, weight = contacts.corners[c, n], contacts.weights[c, n]
+            total += weight * weight * inverse_mass[node]
+            at_m += weight * (x[node, 0] * way[0] + x[node, 1] * way[1] + x[node, 2] * way[2])
+        below_m = contacts.level_m[c] - left * contacts.rise_m[c] - at_m
+        is_active[c] = below_m > 0.0 and total > 0.0
+        if not is_active[c]:
+            continue
+        slip[:] = 0.0
+        for n in range(3):
+            node, weight = contacts.corners[c, n], contacts.weights[c, n]
+            share = weight * inverse_mass[node] / total
+            for k in range(3):
+                x[node, k] += share * below_m * way[k]
+                slip[k] += weight * (x[node, k] - x_before[node, k])
+        _give(x, contacts, c, slip, friction * below_m, total, inverse_mass)
+
+
+@compiled
+def _stop(
+    v: NDArray[np.float64],
+    inverse_mass: NDArray[np.float64],
+    contacts: Contacts,
+    first: int,
+    last: int,
+    friction: float,
+    is_active: NDArray[np.bool_],
+    is_held: NDArray[np.bool_],
+) -> None:
+    """Give samples that were lifted the speed of what they lean on, in place.
+
+    Marks in `is_held` (N,) the nodes that were lifted.
+    """
+    slip = np.zeros(3)
+    for c in range(first, last):
+        if not is_active[c]:
+            continue
+        way = contacts.way[c]
+        total, along = 0.0, 0.0
+        for n in range(3):
+            node, weight = contacts.corners[c, n], contacts.weights[c, n]
+            total += weight * weight * inverse_mass[node]
+            along += weight * (v[node, 0] * way[0] + v[node, 1] * way[1] + v[node, 2] * way[2])
+        given = max(contacts.speed[c] - along, 0.0)
+        slip[:] = 0.0
+        for n in range(3):
+            node, weight = contacts.corners[c, n], contacts.weights[c, n]
+            share = weight * inverse_mass[node] / total
+            is_held[node] |= share > 0.0
+            for k in range(3):
+                v[node, k] += share * given * way[k]
+                slip[k] += weight * v[node, k]
+        _give(v, contacts, c, slip, friction * given, total, inverse_mass)
+
+
+@compiled
+def _give(
+    of_nodes: NDArray[np.float64],
+    contacts: Contacts,
+    contact: int,
+    slip: NDArray[np.float64],
+    most: float,
+    total: float,
+    inverse_mass: NDArray[np.float64],
+) -> None:
+    """Take from what a sample slips, path or speed, what is across the way, at most so much."""
+    if most <= 0.0:
+        return
+    way = contacts.way[contact]
+    out = slip[0] * way[0] + slip[1] * way[1] + slip[2] * way[2]
+    slip -= out * way
+    length = np.sqrt(slip[0] ** 2 + slip[1] ** 2 + slip[2] ** 2)
+    if length == 0.0:
+        return
+    taken = min(1.0, most / length) / total
+    for n in range(3):
+        node = contacts.corners[contact, n]
+        share = taken * contacts.weights[contact, n] * inverse_mass[node]
+        for k in range(3):
+            of_nodes[node, k] -= share * slip[k]
+
+
+@compiled
+def _potential(
+    x: NDArray[np.float64], inverse_mass: NDArray[np.float64], springs: Springs, gravity: float
+) -> float:
+    """Return the potential energy of the nodes that move, joules."""
+    energy = _spring_energy(x, springs)
+    for i in range(len(x)):
+        if inverse_mass[i] > 0.0:
+            energy += gravity * x[i, 2] / inverse_mass[i]
+    return energy
+
+
+@compiled
+def _kinetic(v: NDArray[np.float64], inverse_mass: NDArray[np.float64]) -> float:
+    energy = 0.0
+    for i in range(len(v)):
+        if inverse_mass[i] > 0.0:
+            energy += 0.5 * (v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2) / inverse_mass[i]
+    return energy
+
+
+@compiled
+def move_on(
     x: NDArray[np.float64],
     v: NDArray[np.float64],
     inverse_mass: NDArray[np.float64],
@@ -314,8 +491,12 @@ def move_freely(
     damping_s: float,
     step_s: float,
     n_steps: int,
-) -> None:
-    """Move nodes on in place, by so many steps, as if nothing stood in their way.
+    contacts: Contacts,
+    n_in_hull: int,
+    friction: float,
+    is_held: NDArray[np.bool_],
+) -> tuple[float, float]:
+    """Move nodes on in place, by so many steps.
 
     Parameters
     ----------
@@ -335,11 +516,32 @@ def move_freely(
         Of each step, seconds; see `longest_step`.
     n_steps : int
         How many.
+    contacts : Contacts
+        What the sheet leans on.
+    n_in_hull : int
+        So many of the contacts, the first, are with the hull.
+    friction : float
+        Coulomb's.
+    is_held : (N,) bool
+        Set for nodes that contacts with the hull moved.
+
+    Returns
+    -------
+    float, float
+        What drag and damping have taken, joules; and the work of the contacts that are not with
+        the hull, 0 unless there are both.
     """
-    force = np.zeros_like(x)
+    force, before = np.zeros_like(x), np.zeros_like(x)
+    is_held_otherwise = np.zeros(len(x), np.bool_)
+    n_contacts = len(contacts.level_m)
+    active = np.zeros(n_contacts, np.bool_)
+    is_shared = 0 < n_in_hull < n_contacts
+    lost_j, other_j = 0.0, 0.0
     kept = np.exp(-0.5 * drag_per_s * step_s)  # half before a step, half after it
-    _forces(x, v, springs, damping_s, force)
-    for _ in range(n_steps):
+    power = _forces(x, v, springs, damping_s, force)
+    for step in range(n_steps):
+        before[:] = x
+        lost_j += 0.5 * step_s * power + (1.0 - kept * kept) * _kinetic(v, inverse_mass)
         for i in range(len(x)):
             if inverse_mass[i] > 0.0:
                 for k in range(3):
@@ -347,11 +549,36 @@ def move_freely(
                 v[i, 2] -= 0.5 * step_s * gravity
                 for k in range(3):
                     x[i, k] += step_s * v[i, k]
-        _forces(x, v, springs, damping_s, force)
+        if n_contacts > 0:
+            left = 1.0 - (step + 1.0) / n_steps
+            if is_shared:
+                other_j -= _potential(x, inverse_mass, springs, gravity)
+            _lift(x, before, inverse_mass, contacts, n_in_hull, n_contacts, left, friction, active)
+            if is_shared:
+                other_j += _potential(x, inverse_mass, springs, gravity)
+            _lift(x, before, inverse_mass, contacts, ZERO, n_in_hull, left, friction, active)
+        power = _forces(x, v, springs, damping_s, force)
         for i in range(len(x)):
             if inverse_mass[i] > 0.0:
                 for k in range(3):
                     v[i, k] += 0.5 * step_s * inverse_mass[i] * force[i, k]
                 v[i, 2] -= 0.5 * step_s * gravity
-                for k in range(3):
-                    v[i, k] *= kept
+        lost_j += 0.5 * step_s * power + (1.0 - kept * kept) * _kinetic(v, inverse_mass)
+        v *= kept
+        if n_contacts > 0:
+            if is_shared:
+                other_j -= _kinetic(v, inverse_mass)
+            _stop(
+                v,
+                inverse_mass,
+                contacts,
+                n_in_hull,
+                n_contacts,
+                friction,
+                active,
+                is_held_otherwise,
+            )
+            if is_shared:
+                other_j += _kinetic(v, inverse_mass)
+            _stop(v, inverse_mass, contacts, ZERO, n_in_hull, friction, active, is_held)
+    return lost_j, other_j

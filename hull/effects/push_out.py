@@ -17,7 +17,8 @@ pixel to pixel, but not everywhere at once: the object's share of a window about
 movement to a fraction of a pixel. Where it moved farther than a window tells, the ways out of both
 hulls are compared.
 
-Samples that hang on pinned nodes by more than half cannot follow: they are held.
+What hangs on pinned nodes cannot always follow. Held are the samples of triangles of which a pinned
+corner is in the hull, and those that hang by more than half on pinned corners outside of it.
 """
 
 import numpy as np
@@ -36,10 +37,13 @@ _MARCH_M, _EXACT_M = 5e-4, 1e-6
 #: inside again. Metres.
 _BEYOND_M = 1e-5
 
+#: A sample leans on a hull that is no farther below it, and not farther above, metres.
+_NEAR_M, _FAR_M = 1e-3, 0.02
+
 #: No way out is longer, metres: no hull is.
 _REACH_M = 2.0
 
-#: A sample that its free corners make up less of is held.
+#: A sample that its free corners make up less of is held: they would go farther than twice as far.
 LEAST_FREE = 0.5
 
 #: Radius of the window that an outline's direction is taken from, pixels; as
@@ -391,6 +395,85 @@ def may_meet(
 
 
 @compiled
+def _write_weights(viewport: int, sample: int, weights: NDArray[np.float64]) -> None:
+    """Write what the corners weigh in a sample of a viewport, (3,)."""
+    i, j = sample + ZERO, ZERO
+    while i >= viewport - j:
+        i -= viewport - j
+        j += 1
+    weights[:] = 1.0 / 3.0
+    if viewport > 1:
+        weights[1], weights[2] = i / (viewport - 1.0), j / (viewport - 1.0)
+        weights[0] = 1.0 - weights[1] - weights[2]
+
+
+@compiled
+def renew(
+    x: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    viewports: NDArray[np.int32],
+    frame: Frame,
+    before: Frame,
+    elapsed_s: float,
+    kept_sample: NDArray[np.int64],
+    kept_way: NDArray[np.float64],
+) -> tuple[
+    NDArray[np.int64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]:
+    """Return the contacts of samples that were moved before and still lean on the hull.
+
+    Those are kept below which, by no more than `_NEAR_M`, the hull is; the others are forgotten.
+
+    Parameters
+    ----------
+    kept_sample, kept_way : (T, 3), (T, 3, 3)
+        As `push_hits` wrote them; samples that are forgotten become -1.
+
+    The others are those of `push_hits`. Returned are the arrays of
+    `hybridve.hull.effects.cloth_model.Contacts`.
+    """
+    most = np.count_nonzero(kept_sample >= 0)
+    corners = np.zeros((most, 3), np.int64)
+    weights, way = np.zeros((most, 3)), np.zeros((most, 3))
+    level_m, rise_m, speed = np.zeros(most), np.zeros(most), np.zeros(most)
+    point = np.zeros(3)
+    n = ZERO
+    for t in range(len(faces)):
+        for corner in range(3):
+            if kept_sample[t, corner] < 0:
+                continue
+            _write_weights(viewports[t], kept_sample[t, corner], weights[n])
+            way[n] = kept_way[t, corner]
+            at_m = 0.0
+            point[:] = origin - _NEAR_M * way[n]
+            for c in range(3):
+                node = faces[t, c]
+                corners[n, c] = node
+                for axis in range(3):
+                    point[axis] += weights[n, c] * x[node, axis]
+                    at_m += weights[n, c] * x[node, axis] * way[n, axis]
+            out_m = way_out(point, way[n], frame, _FAR_M)
+            if out_m <= 0.0:
+                kept_sample[t, corner] = -1
+                continue
+            rise_m[n] = max(out_m - _NEAR_M, 0.0)
+            level_m[n] = at_m - _NEAR_M + out_m
+            speed[n] = 0.0
+            if elapsed_s > 0.0:
+                advance_m = _advance_of_outline(point + out_m * way[n], way[n], frame, before)
+                if not np.isnan(advance_m):
+                    speed[n] = advance_m / elapsed_s
+            n += 1
+    return corners[:n], weights[:n], way[:n], level_m[:n], rise_m[:n], speed[:n]
+
+
+@compiled
 def push_hits(
     x: NDArray[np.float64],
     origin: NDArray[np.float64],
@@ -407,6 +490,8 @@ def push_hits(
     side: NDArray[np.float64],
     shift: NDArray[np.float64],
     speed: NDArray[np.float64],
+    kept_sample: NDArray[np.int64],
+    kept_way: NDArray[np.float64],
     least_m: float,
     whole: bool,
 ) -> tuple[float, int]:
@@ -438,6 +523,9 @@ def push_hits(
         To these is added: the sum of unit vectors along which a node was moved times how far, and
         how far; the sum of the speeds with which the hull went along them, times that, and that.
         Nothing is added to `speed` where it is not known.
+    kept_sample, kept_way : (T, 3), (T, 3, 3)
+        Of each triangle, the samples that were moved and where, one for each corner that weighs
+        most: written; see `renew`.
     least_m : float
         Where no sample is deeper, nothing is moved.
     whole : bool
@@ -459,16 +547,7 @@ def push_hits(
     deepest_m = 0.0
     for k in range(count):
         t = triangle[k]
-        u, s = viewports[t], np.int64(sample[k])
-        j = ZERO
-        while s >= u - j:
-            s -= u - j
-            j += 1
-        if u == 1:
-            weights[k] = 1.0 / 3.0
-        else:
-            weights[k, 1], weights[k, 2] = s / (u - 1.0), j / (u - 1.0)
-            weights[k, 0] = 1.0 - weights[k, 1] - weights[k, 2]
+        _write_weights(viewports[t], sample[k], weights[k])
         free = 0.0
         about[:] = 0.0
         point[:] = origin
@@ -476,6 +555,10 @@ def push_hits(
             node = faces[t, c]
             if inverse_mass[node] > 0.0:
                 free += weights[k, c]
+            elif _is_in(
+                x[node, 0] + origin[0], x[node, 1] + origin[1], x[node, 2] + origin[2], frame
+            ):
+                free = -np.inf
             for axis in range(3):
                 point[axis] += weights[k, c] * x[node, axis]
                 about[axis] += weights[k, c] * side[node, axis]
@@ -526,6 +609,9 @@ def push_hits(
                 if behind_m >= 0.0:
                     hull_speed, is_known = (left_m + behind_m) / elapsed_s, True
         left_m += _BEYOND_M
+        corner = np.argmax(weights[k])
+        kept_sample[t, corner] = sample[k]
+        kept_way[t, corner] = ways[k]
         total, free = 0.0, 0.0
         for c in range(3):
             total += weights[k, c] ** 2 * inverse_mass[faces[t, c]]

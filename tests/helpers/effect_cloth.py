@@ -95,25 +95,19 @@ def half_space_views() -> Views:
     return make_views(("above", "side"), np.array([[640, 640]] * 2), np.array(matrices))
 
 
-def half_space(views: Views, y_m: float, band_m: float) -> Hull:
-    """Return all below a plane, for |z| up to about `band_m`, of `half_space_views`.
+def half_space(views: Views, y_m: float) -> Hull:
+    """Return all below a plane, as far as the cameras of `half_space_views` see.
 
     The plane goes through the camera above and, at z = 0, through y = `y_m`.
     """
-    masks = []
-    for camera in range(2):
-        width, height = views.sizes_px[camera].tolist()
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
-        matrix = views.img_from_local[camera]
-        rays = pixels @ np.linalg.inv(matrix[:, :3]).T
-        center = views.origin_world + views.centers_local()[camera]
-        # To the plane z = 0 from above, to x = 0 from the side.
-        axis = 2 if camera == 0 else 0
-        hit = center - rays * (center[axis] / rays[..., axis])[..., None]
-        inside = hit[..., 1] < y_m if camera == 0 else np.abs(hit[..., 2]) < band_m
-        masks.append(inside.astype(np.uint8))
-    return make_hull(views, masks)
+    width, height = views.sizes_px[0].tolist()
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = rays @ np.linalg.inv(views.img_from_local[0, :, :3]).T
+    center = views.origin_world + views.centers_local()[0]
+    at_floor = center - rays * (center[2] / rays[..., 2])[..., None]
+    below = (at_floor[..., 1] < y_m).astype(np.uint8)
+    return make_hull(views, [below, np.ones_like(below)])
 
 
 def deepest_m(hull: Hull, thing: SceneObject, vertices_m: NDArray[np.float64]) -> float:
