@@ -339,7 +339,7 @@ def test_it_stays_sound_and_out_of_the_hull(
 def test_a_sheet_that_blows_up_is_stopped_and_named() -> None:
     cloth = make_cloth(VIEWS, [sheet()])
     state = dict(cloth.state())
-    state["sheet.velocities"] = state["sheet.velocities"] + 1e100
+    state["sheet.velocities"][-1] = np.nan
     cloth.restore(state)
 
     with pytest.raises(UnstableError, match=r"cloth 'sheet' at 0\.002 s"):

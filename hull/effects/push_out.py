@@ -245,7 +245,7 @@ def _cone_way(
     q_x, q_y = x + to_x, y + to_y
     n_x, n_y = _outline_normal(frame.answers, image, q_x, q_y)
     forward = n_x * to_x + n_y * to_y
-    if forward <= 0.5 * apart:  # a corner of the outline, or a hair of it
+    if (n_x == 0.0 and n_y == 0.0) or forward < 0.5 * apart:  # a corner, or a hair, of the outline
         if apart == 0.0:
             return np.inf
         n_x, n_y, forward = to_x / apart, to_y / apart, apart

@@ -43,15 +43,16 @@ def sheet(
 def thing(
     name: str,
     vertices: NDArray[np.float64],
-    faces: NDArray[np.int32],
+    faces: NDArray[np.int32] | NDArray[np.int64],
     direction: tuple[float, float, float] | None = None,
 ) -> SceneObject:
     """Return an object of a scene."""
+    faces = np.asarray(faces, np.int32)
     return SceneObject(
         name=name,
         mesh_path=Path("sheet.stl"),
         vertices_world=np.asarray(vertices, np.float64),
-        faces=np.asarray(faces, np.int32),
+        faces=faces,
         required_clearance_m=0.0,
         reference_point_world=vertices.mean(axis=0),
         recovery_direction=None if direction is None else np.array(direction),
