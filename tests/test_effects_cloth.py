@@ -23,6 +23,7 @@ from helpers.effect_cloth import (
     thing,
     views_around,
 )
+from helpers.hulls import ring_views
 from helpers.response import ball_silhouettes
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -280,6 +281,20 @@ def test_a_still_hull_does_no_work_on_a_sheet_that_leans_on_it() -> None:
     assert (np.diff(work) <= 1e-12).all()  # it only takes
     energy = np.array([row.energy_j for row in rows])
     assert energy.max() <= 1e-3 * np.abs(energy).max()
+
+
+def test_a_hull_without_an_end_near_moves_nothing_and_is_told() -> None:
+    """Cameras that abstain see no background at all: the hull ends where none sees, metres away."""
+    views = ring_views(4, 64, 48, 60.0, 8.0, unseen="keep")
+    everything = make_hull(views, [np.ones((48, 64), np.uint8)] * 4)
+    hung = sheet((3, 3), (0.2, 0.2), direction=(0.0, 1.0, 0.0))
+    for recovery in ("direction", "nearest"):
+        cloth = make_cloth(views, [hung], recovery=recovery)
+
+        *_, last = drive(cloth, lambda _: everything, 3)
+
+        assert last.values["displacement_m"] < 1e-3
+        assert last.values["penetration_m"] > 1.0
 
 
 # ---------------------------------------------------------------------------- when it is hard

@@ -413,6 +413,7 @@ class _Sheet:
         for turn in range(_BY_WEIGHT + _WHOLE + _ONE_WAY):
             if turn == _BY_WEIGHT + _WHOLE and not constrained.any():
                 constrained = _main_way(shift)
+            asked = x.copy()
             depth_m, n_held = push_hits(
                 x,
                 origin,
@@ -434,7 +435,7 @@ class _Sheet:
                 turn >= _BY_WEIGHT,
             )
             state["n_held"][:] = n_held
-            if turn > 0 and depth_m <= _LEFT_M:
+            if turn > 0 and (depth_m <= _LEFT_M or (x == asked).all()):
                 break
             if turn == 0:
                 touch(x, v, start, self._inverse_mass, shift, speed, self._friction, state["side"])

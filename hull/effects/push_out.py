@@ -590,10 +590,8 @@ def push_hits(
             for axis in range(3):
                 point[axis] += weights[k, c] * x[faces[t, c], axis]
         left_m = way_out(point, ways[k], frame, _REACH_M)
-        if left_m == 0.0:
+        if left_m <= 0.0:  # out by now; or cameras that abstain leave the hull without an end
             continue
-        if left_m < 0.0:
-            left_m = _REACH_M
         hull_speed, is_known = 0.0, False
         if elapsed_s > 0.0:
             advance_m = _advance_of_outline(point + left_m * ways[k], ways[k], frame, before)
