@@ -5,6 +5,7 @@ them after a step is asked of `contains_few` and `spans_in_hull`, not of the eff
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,11 +30,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from hybridve.calib.errors import SceneError
-from hybridve.hull.cad.scene import SceneObject
+from hybridve.hull.cad.scene import SceneObject, load_scene
 from hybridve.hull.effects.cloth_model import highest_frequency, longest_step, make_springs, weld
-from hybridve.hull.effects.effect import GRAVITY_M_S2, UnstableError
+from hybridve.hull.effects.effect import GRAVITY_M_S2, Instant, Setting, UnstableError
+from hybridve.hull.effects.kinds import make_effects, read_entries
+from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Hull, make_hull
-from hybridve.hull.synth.meshes import ball_mesh, box_mesh
+from hybridve.hull.synth.meshes import ball_mesh, box_mesh, sheet_mesh, write_stl
 
 #: What a sample may be deep after a step, metres.
 LEFT_M = 1e-3
@@ -455,6 +458,47 @@ def test_vertices_that_a_file_repeats_move_as_one() -> None:
     np.testing.assert_allclose(
         last.vertices_m - np.array([0.1, 0.2, 0.3]) / 3, corners, rtol=0, atol=1e-9
     )
+
+
+def test_a_scene_names_a_cloth_and_its_stl_is_welded(tmp_path: Path) -> None:
+    write_stl(tmp_path / "curtain.stl", sheet_mesh((760, 840), (18, 20), 12, 3), "millimetres")
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        """
+format = "hybridve-scene"
+version = 1
+[[object]]
+name = "curtain"
+mesh = "curtain.stl"
+unit = "mm"
+translate_mm = [370, 260, 720]
+rotate_deg = [0, 0, 30]
+recovery_direction = [0, 1, 0]
+[[effect]]
+kind = "cloth"
+object = "curtain"
+pin = "top"
+""",
+        encoding="utf-8",
+    )
+    scene = load_scene(path)
+    found = read_entries(scene)
+    claimed = frozenset(found[0][0].table.claimed)
+    setting = Setting(scene, claimed, VIEWS, Native(1), step_s=STEP_S, frame_s=1 / 60)
+
+    ((effect, entries),) = make_effects(found, setting)
+
+    assert [entry.name for entry in entries] == ["curtain"]
+    about = effect.told["curtain"].about
+    assert (about["nodes"], about["triangles"], about["pinned_nodes"]) == (399, 720, 19)
+    turned = [-np.sin(np.radians(30.0)), np.cos(np.radians(30.0)), 0.0]
+    np.testing.assert_allclose(about["recovery_direction"], turned, atol=1e-12)
+    for step in range(3):
+        effect.advance(Instant((step + 1) * STEP_S, EMPTY, EMPTY, STEP_S, 0), STEP_S)
+    vertices_m = effect.values()["curtain"]["vertices_m"]
+    assert vertices_m.shape == scene.objects[0].vertices_world.shape
+    # Corners that met in the file still meet.
+    assert len(np.unique(vertices_m[scene.objects[0].faces].reshape(-1, 3), axis=0)) == 399
 
 
 def test_a_vertex_that_no_triangle_uses_stays() -> None:
