@@ -53,6 +53,7 @@ def synth(
       payload  a pipe and a cord between two payloads: how much room do they need?
       ball     blocks about a virtual ball
       curtain  two hands that part a curtain in a window
+      bounce   a virtual ball among real blocks
 
     \b
     Example:

@@ -119,7 +119,7 @@ def test_the_ball_and_the_curtain_are_sessions_with_a_scene(synth: Callable[...,
         (("payload", "--participant", "0"), "participant is 0, expected 1 to 4"),
         (("payload", "--gap-mm", "-10"), "gap_mm is -10, expected 60 to 400"),
         (("payload", "--gap-mm", "nan"), "gap_mm is nan, expected 60 to 400"),
-        (("payloads",), "no preset 'payloads'; one of boxes, payload, ball, curtain"),
+        (("payloads",), "no preset 'payloads'; one of boxes, payload, ball, curtain, b"),
     ],
 )
 def test_what_a_preset_does_not_have_is_refused_in_one_line(
