@@ -24,6 +24,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,7 @@ _CHILD = """
 import json, resource, sys, time
 started = time.perf_counter()
 from pathlib import Path
+from typing import Any
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.chain import EvaluateSettings, hulls, make_chain
@@ -136,7 +138,7 @@ def _say(line: str) -> None:
     sys.stdout.flush()
 
 
-def _run(session: Path, scene: Path, *, warm: bool = False) -> dict[str, float | list[float]]:
+def _run(session: Path, scene: Path, *, warm: bool = False) -> dict[str, Any]:
     """Return what a run took, after one that compiles if it is to be warm."""
     for _ in range(1 + warm):
         done = subprocess.run(
@@ -148,7 +150,7 @@ def _run(session: Path, scene: Path, *, warm: bool = False) -> dict[str, float |
         )
         if done.returncode:
             raise RuntimeError(done.stderr)
-    found: dict[str, float | list[float]] = json.loads(done.stdout)
+    found: dict[str, Any] = json.loads(done.stdout)
     return found
 
 
