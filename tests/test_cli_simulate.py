@@ -116,7 +116,7 @@ def test_every_effect_meets_the_ball_and_tells_it(
         rtol=1e-6,
     )
     assert np.isfinite(groups["light"].values["illuminance_lx"]).all()
-    bounds_m = groups["proximity"].values["clearance_m"]
+    bounds_m = groups["ground.proximity"].values["clearance_m"]
     # From the ground's top at -0.4 m to the lowest point of the ball at -0.2 m; the hull of six
     # cameras from above bulges downwards.
     assert (bounds_m[:, 0] <= 0.2 + 1e-6).all()
