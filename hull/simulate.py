@@ -308,14 +308,13 @@ class Simulation:
                     break
         elif frame.hull is not None:
             self.has_begun = True
-        values = {
-            name: dict(columns)
-            for effect, _ in self.effects
-            for name, columns in effect.values(frame.hull).items()
-        }
-        for (_, names), effect_s in zip(self.effects, seconds, strict=True):
+        values: dict[str, dict[str, NDArray[Any]]] = {}
+        for number, (effect, names) in enumerate(self.effects):
+            started = time.perf_counter()
+            told = effect.values(frame.hull)
+            seconds[number] += time.perf_counter() - started
             for name in names:
-                values[name]["step_s"] = np.array(effect_s)
+                values[name] = {**told[name], "step_s": np.array(seconds[number])}
         return SimulatedFrame(
             index=frame.index,
             time_s=frame.time_s,
@@ -412,7 +411,8 @@ _STEP_S = Quantity(
     "step_s",
     "s",
     "exact",
-    "seconds that the steps to this frame took, of all entries that are simulated together",
+    "seconds that the steps to this frame took, and what is told of it, of all entries that are "
+    "simulated together",
 )
 
 

@@ -83,6 +83,29 @@ def write_scene(folder: Path, effects: str = EFFECTS) -> Path:
 
 
 @pytest.mark.slow
+def test_the_same_call_gives_the_same_but_for_timings(
+    run: Run, tmp_path: Path, session: Path
+) -> None:
+    scene = write_scene(tmp_path)
+    found: list[dict[str, np.ndarray]] = []
+    for name in ("one.h5", "two.h5"):
+        path = tmp_path / name
+        assert run("simulate", session, "--scene", scene, "-o", path, "--frames", "2:6") == 0
+        columns: dict[str, np.ndarray] = {}
+        with h5py.File(path) as file:
+            for group in file["hybridve/effects"].values():
+                for key, values in group.items():
+                    if isinstance(values, h5py.Dataset) and key != "step_s":
+                        columns[f"{group.name}/{key}"] = values[()]
+        found.append(columns)
+
+    assert found[0].keys() == found[1].keys()
+    assert len(found[0]) > 40
+    for key, values in found[0].items():
+        np.testing.assert_array_equal(values, found[1][key], err_msg=key)
+
+
+@pytest.mark.slow
 def test_every_effect_meets_the_ball_and_tells_it(
     run: Run, tmp_path: Path, session: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

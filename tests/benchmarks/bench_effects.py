@@ -11,7 +11,8 @@ row "none" goes through the same frames without any, and imports none. Told are
 * memory: the most that the process held, beyond that of "none".
 
 Compiled code is at hand: each row runs once before. Bodies hang about the way of the ball, which
-meets some of them.
+meets some of them. Last, `hybridve detect` with a scene that names effects, which it leaves alone,
+and with the same scene without them, in turn: seconds from the command to its end.
 
 Run: python tests/benchmarks/bench_effects.py
 """
@@ -22,6 +23,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -130,7 +132,27 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
                 f"({told['frame_p95_ms']:.1f})   {told['between_ms']:8.1f}   "
                 f"{told['memory_mb']:8.0f}"
             )
+        for label, seconds in _detects(session, folder, 1 if asked.smallest else 5).items():
+            numbers[f"detect, {label}.median_s"] = float(np.median(seconds))
+            _say(f"detect, {label:17} {np.median(seconds):8.2f} s ({np.ptp(seconds):.2f} apart)")
     return numbers
+
+
+def _detects(session: Path, folder: Path, repeats: int) -> dict[str, list[float]]:
+    """Return how long `detect` takes with a scene that names effects and one that names none."""
+    with_effects = write_scene(folder, _TOGETHER)
+    text = with_effects.read_text(encoding="utf-8")
+    without = folder / "without.toml"
+    without.write_text(text.partition("[[effect]]")[0], encoding="utf-8")
+    took: dict[str, list[float]] = {"effects named": [], "none named": []}
+    for _ in range(repeats):
+        for label, scene in (("effects named", with_effects), ("none named", without)):
+            command = [sys.executable, "-m", "hybridve.cli", "-q", "detect", str(session)]
+            asked = ["--scene", str(scene), "-o", str(folder / "r.h5"), "--overwrite"]
+            started = time.perf_counter()
+            subprocess.run([*command, *asked, "--no-progress"], check=True, stdout=subprocess.PIPE)
+            took[label].append(time.perf_counter() - started)
+    return took
 
 
 def _say(line: str) -> None:
