@@ -9,6 +9,7 @@ import click
 
 from hybridve.calib.errors import HybridveError
 from hybridve.cli.calibrate import calibrate
+from hybridve.cli.check import check
 from hybridve.cli.convert import convert
 from hybridve.cli.demo import demo
 from hybridve.cli.detect import detect
@@ -58,7 +59,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 
 for command in (
-    *(demo, synth, calibrate, convert, segment, detect),
+    *(demo, synth, check, calibrate, convert, segment, detect),
     *(spacing, sweep, simulate, summary, render, doctor),
 ):
     cli.add_command(command)
