@@ -8,6 +8,7 @@ from typing import NoReturn
 import click
 
 from hybridve.calib.errors import HybridveError
+from hybridve.cli.board import board
 from hybridve.cli.calibrate import calibrate
 from hybridve.cli.check import check
 from hybridve.cli.convert import convert
@@ -59,7 +60,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 
 for command in (
-    *(demo, synth, check, calibrate, convert, segment, detect),
+    *(demo, synth, board, check, calibrate, convert, segment, detect),
     *(spacing, sweep, simulate, summary, render, doctor),
 ):
     cli.add_command(command)
