@@ -21,6 +21,7 @@ _RIGS = {
     "made here": "made from this session's own board",
     "no board": "given; there is no board in the session to test it with",
     "off": "given, and not tested (rig_check)",
+    "not looked at": "there is one, for a recording to come",
     "open": "given; the session's board leaves open whether it is right",
     "not tested": "given; the session's board could not be read",
 }
@@ -172,6 +173,8 @@ def _tell_rig(found: "SessionCheck") -> None:
             click.echo("there is no rig yet: `hybridve calibrate` comes first")
         return
     click.echo(f"rig: {_RIGS.get(found.rig, found.rig)}")
+    if found.rig == "not looked at":
+        return
     frames = options.counted(len(found.frames), "frame")
     if not found.agreement.is_told:
         click.echo(f"on {frames} the cameras say too little about each other")

@@ -44,12 +44,14 @@ from hybridve.hull.capture.recording import (
     FrameRange,
     Mask,
     check_lengths,
+    check_recording,
     segmented_frames,
     undistort_mask,
 )
 from hybridve.hull.capture.rig import has_rig, load_rig
 from hybridve.hull.capture.room_check import RoomCheck, check_room
 from hybridve.hull.capture.session import Session, load_session
+from hybridve.hull.capture.silhouette_io import SilhouetteWriter
 from hybridve.hull.capture.tracks import Tracks, read_tracks
 from hybridve.hull.chain import EvaluateSettings, first_rig, make_chain, moved_views, rig_views
 from hybridve.hull.effects.kinds import read_entries
@@ -169,7 +171,8 @@ class SessionCheck(Told):
     looks : tuple of CameraLooks
         What they show.
     rig : str
-        How the rig stands: "made here", "agrees", ..., or "none".
+        How the rig stands: "made here", "agrees", ..., "not looked at" where there is no recording
+        that it would be used for, or "none".
     agreement : SessionAgreement
         What the cameras say about each other on these frames.
     objects : tuple of ObjectCheck
@@ -261,6 +264,8 @@ def check_session(
     found = SessionCheck(str(session.path), cameras, effects=effects)
     is_recorded = all(camera.recording is not None for camera in session.cameras)
     rig, room = None, RoomCheck()
+    if has_rig(session):
+        found = replace(found, rig="not looked at")
     if is_recorded and has_rig(session) and not problems:
         rig = asked.of(lambda: load_rig(session, watcher.stage))
         if rig is not None:
@@ -330,7 +335,7 @@ def _looked_at(session: Session, cameras: Sequence[CameraFiles], watcher: Watche
     end = min(lengths)
     if any(one.recording is not None and one.recording.is_video for one in cameras):
         # A header may promise a few frames more than there are.
-        end = min(end - HEADER_SLACK, _MOST_READ)
+        end = min(end - min(HEADER_SLACK, end // 20), _MOST_READ)
     step = max(1, (end - 1) // (N_LOOKS - 1))
     end = max(end, 1)
     found = _Frames(max(max(lengths), 1), len(range(0, end, step)), step)
@@ -533,6 +538,10 @@ def _trial(
     sizes, counts = [], []
     chain = make_chain(session, layout, settings, watcher.stage)
     with tempfile.TemporaryDirectory() as folder:
+        if chain.silhouettes is None:
+            stored = Path(folder) / "silhouettes.h5"
+            _store(session, FrameRange(middle, middle + _N_TRIED), stored)
+            chain = replace(chain, silhouettes=stored)
         for number, count in enumerate((1, _N_TRIED)):
             path = Path(folder) / f"trial{number}.h5"
             asked = replace(settings, frames=FrameRange(middle, middle + count))
@@ -548,6 +557,20 @@ def _trial(
     per_frame_bytes = max(0, sizes[1] - sizes[0]) / max(1, counts[1] - counts[0])
     disk = sizes[1] + per_frame_bytes * max(0, frames.n_frames - counts[1])
     return frames.n_frames * per_frame_s, round(disk), "native"
+
+
+def _store(session: Session, frames: FrameRange, path: Path) -> None:
+    """Keep the silhouettes of a few frames, so that they are cut out once; each at its number."""
+    sizes_px = check_recording(session)
+    names = [camera.name for camera in session.cameras]
+    with (
+        closing(segmented_frames(session, frames)) as cut,
+        SilhouetteWriter(path, names, sizes_px, "") as writer,
+    ):
+        for _ in range(frames.start):
+            writer.append(None, "not looked at")
+        for frame in cut:
+            writer.append(frame.masks, frame.reason)
 
 
 def _peak_bytes() -> int | None:

@@ -151,7 +151,7 @@ def survey(folder: Path) -> Survey:
         Find(
             _pattern(folder, paths, files),
             tuple(paths),
-            (by_folder and words.folder) or words.file,
+            (by_folder and words.folder) or words.file or words.folder,
             _role(words.role, paths),
         )
         for words, paths in named
