@@ -106,7 +106,8 @@ def check(
 
 def _tell(found: "SessionCheck") -> None:
     if found.cameras:
-        click.echo(f"{found.session}: {options.counted(len(found.cameras), 'camera')}")
+        rate = "" if found.fps is None else f", {found.fps:g} frames a second"
+        click.echo(f"{found.session}: {options.counted(len(found.cameras), 'camera')}{rate}")
     _tell_files(found)
     _tell_looks(found)
     _tell_rig(found)
@@ -165,6 +166,9 @@ def _tell_looks(found: "SessionCheck") -> None:
         shares = ("-" if share is None else f"{share:.1%}" for share in one.object_share)
         rows.append((one.name, *shares))
     options.print_table(rows)
+    step = found.frames[-1] - found.frames[-2] if len(found.frames) > 1 else 1
+    if found.cost is not None and found.cost.n_frames > found.frames[-1] + 2 * step:
+        click.echo(f"  what comes after frame {found.frames[-1]} was not looked at")
 
 
 def _tell_rig(found: "SessionCheck") -> None:

@@ -116,8 +116,8 @@ class ObjectCheck(Told):
     is_closed : bool
         Whether it has an inside.
     seen_share : float or None
-        The share of its surface that cameras enough see; None without a rig. An object that moves
-        is where it is in the first frame that has its pose.
+        The share of its surface that cameras enough see; None without a rig, or where a camera
+        moves. An object that moves is where it is in the first frame that has its pose.
     """
 
     name: str
@@ -164,6 +164,8 @@ class SessionCheck(Told):
     ----------
     session : str
         The session.toml.
+    fps : float or None
+        Frames a second, as the session or its videos say; None if it could not be loaded.
     cameras : tuple of CameraFiles
         Their files.
     frames : tuple of int
@@ -186,6 +188,7 @@ class SessionCheck(Told):
     """
 
     session: str
+    fps: float | None = None
     cameras: tuple[CameraFiles, ...] = ()
     frames: tuple[int, ...] = ()
     looks: tuple[CameraLooks, ...] = ()
@@ -261,7 +264,7 @@ def check_session(
         problems += one.problems
         notes += one.notes
     notes += compare_cameras(session.path, cameras)
-    found = SessionCheck(str(session.path), cameras, effects=effects)
+    found = SessionCheck(str(session.path), session.fps, cameras, effects=effects)
     is_recorded = all(camera.recording is not None for camera in session.cameras)
     rig, room = None, RoomCheck()
     if has_rig(session):
@@ -290,7 +293,7 @@ def check_session(
             found = replace(found, cost=cost)
     notes += [cause.message for cause in found.agreement.causes]
     if layout is not None:
-        views = None if rig is None else _views(session, rig)
+        views = None if rig is None else asked.of(lambda: _still_views(session, rig))
         objects = tuple(_object(one, views) for one in layout.objects)
         notes += _placing_notes(layout, objects, views)
         found = replace(found, objects=objects)
@@ -401,8 +404,9 @@ def _is_always_same(masks: Sequence[Mask | None]) -> bool:
     return all(np.array_equal(known[0], mask) for mask in known[1:])
 
 
-def _views(session: Session, rig: Rig) -> Views:
-    return rig_views(session, first_rig(rig, read_tracks(session, rig)))[0]
+def _still_views(session: Session, rig: Rig) -> Views | None:
+    """Return the cameras' views; None where one moves, and sees another place in each frame."""
+    return None if read_tracks(session, rig) else rig_views(session, rig)[0]
 
 
 def _agreement(session: Session, rig: Rig, room: RoomCheck, frames: _Frames) -> SessionAgreement:
@@ -465,6 +469,7 @@ def _placing_notes(layout: Scene, objects: Sequence[ObjectCheck], views: Views |
     reach_mm = float(np.median(np.linalg.norm(centers_mm - middle_mm, axis=1)))
     notes = []
     files: dict[str, list[ObjectCheck]] = {}
+    moving = {str(one.about.get("object", one.name)) for one in layout.objects if one.motion}
     for part, one in zip(layout.objects, objects, strict=True):
         files.setdefault(str(part.about.get("object", part.name)), []).append(one)
     for name, parts in files.items():
@@ -481,7 +486,7 @@ def _placing_notes(layout: Scene, objects: Sequence[ObjectCheck], views: Views |
         away_mm = float(
             np.linalg.norm(np.maximum(0.0, np.maximum(low - middle_mm, middle_mm - high)))
         )
-        if any(one.seen_share for one in parts):
+        if name in moving or any(one.seen_share for one in parts):
             continue
         if away_mm > _FAR * reach_mm:
             notes.append(

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -105,7 +107,7 @@ NOTES: list[tuple[str, Callable[[Path], object], str]] = [
     (
         "a gap",
         lambda folder: (folder / "cam1" / "3.png").unlink(),
-        "of 1 instants that other cameras have pictures of this one has none",
+        "'cam1/*.png' lacks 1 of the instants of which other cameras have pictures",
     ),
 ]
 
@@ -215,6 +217,24 @@ def test_a_part_a_thousand_times_too_large_is_told(
     assert said is None or said in told[0]
 
 
+@pytest.mark.slow  # an effect brings its solver
+def test_effects_are_named_and_one_that_cannot_be_read_is_a_problem(
+    session: Path, check: Check
+) -> None:
+    scene = write_cube_scene(session / "scene", {"cube": (0.0, 0.0, 0.0)})
+    whole = scene.read_text(encoding="utf-8")
+    (session / "rig.csv").rename(session / "no_rig.csv")  # nothing is evaluated
+
+    scene.write_text(f'{whole}[[effect]]\nkind = "rigid"\nobject = "cube"\n', encoding="utf-8")
+    _, named = check(session, "--scene", scene)
+    scene.write_text(f'{whole}[[effect]]\nkind = "rigidd"\n', encoding="utf-8")
+    _, unknown = check(session, "--scene", scene)
+
+    assert named["effects"] == ["rigid"]
+    assert unknown["effects"] == []
+    assert any("there is no effect 'rigidd'" in line for line in unknown["problems"])
+
+
 @pytest.mark.slow
 def test_cameras_that_are_exchanged_are_told(session: Path, check: Check) -> None:
     (session / "cam0").rename(session / "cam")
@@ -308,6 +328,29 @@ def test_tags_of_files_are_told_and_a_mixture_is_noted(tmp_path: Path, check: Ch
     (note,) = [one for one in found["notes"] if "to be looked at differently" in one]
     assert "intrinsics turned by 90 degrees" in note
     assert "video upright" in note
+
+
+def test_the_rotation_of_a_video_is_told(tmp_path: Path, check: Check) -> None:
+    folder = video_session(tmp_path / "session", video="turned.mp4")
+    write_video(folder / "turned.mp4", fourcc="mp4v")
+    content = bytearray((folder / "turned.mp4").read_bytes())
+    # The matrix of the track's header, as a telephone held upside down writes it: 180 degrees.
+    at = content.find(b"tkhd") + 4 + 4 + 36
+    turned = [-(1 << 16), 0, 0, 0, -(1 << 16), 0, 64 << 16, 48 << 16, 1 << 30]
+    content[at : at + 36] = b"".join(one.to_bytes(4, "big", signed=True) for one in turned)
+    (folder / "turned.mp4").write_bytes(content)
+
+    _, found = check(folder)
+
+    assert found["cameras"][0]["sources"][1]["orientation"] == "turned by 180 degrees"
+    assert any("video turned by 180 degrees" in note for note in found["notes"])
+
+
+@pytest.mark.slow  # a process of its own
+def test_the_text_needs_no_opengl() -> None:
+    code = "import sys; import hybridve.hull.check; sys.exit('moderngl' in sys.modules)"
+
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def write_turned_jpeg(path: Path, orientation: int) -> None:

@@ -212,8 +212,8 @@ def _inspect(
     n_missing = _n_lacking(session, key, source)
     if n_missing:
         notes.append(
-            f"{where}: {source.label!r}: of {n_missing} instants that other cameras have "
-            "pictures of this one has none; each counts without this camera"
+            f"{where}: {source.label!r} lacks {n_missing} of the instants of which other cameras "
+            "have pictures; the others stay in their places"
         )
     some = source.paths[:: -(-len(source.paths) // _MOST_TAGS)]
     marks = {said_orientation(path, is_video=source.is_video) for path in some}
