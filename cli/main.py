@@ -1,7 +1,9 @@
 """The command ``hybridve``: its sub-commands, and the one place where errors become text."""
 
 import logging
+import re
 import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import NoReturn
 
@@ -88,10 +90,28 @@ def _is_interruption(error: BaseException | None) -> bool:
     return False
 
 
+#: What may stand behind a command as well as before it.
+_FOR_ALL = re.compile(r"-q|-v+|--quiet|--verbose")
+
+
+def _in_order(words: Sequence[str]) -> list[str]:
+    """Return a command line with what holds for all commands before the command.
+
+    Examples
+    --------
+    >>> _in_order(["detect", "s", "-q", "-o", "r.h5"])
+    ['-q', 'detect', 's', '-o', 'r.h5']
+    """
+    end = list(words).index("--") if "--" in words else len(words)
+    first = [word for word in words[:end] if _FOR_ALL.fullmatch(word)]
+    rest = [word for word in words[:end] if not _FOR_ALL.fullmatch(word)]
+    return [*first, *rest, *words[end:]]
+
+
 def main() -> NoReturn:
     """Run the command line and leave with its exit status."""
     try:
-        cli.main(standalone_mode=False)
+        cli.main(_in_order(sys.argv[1:]), standalone_mode=False)
     except click.ClickException as error:  # wrong usage
         error.show()
         sys.exit(error.exit_code)

@@ -171,6 +171,13 @@ class Simulation:
     def of(cls, chain: Chain, engine: Engine, settings: SimulateSettings) -> "Simulation":
         """Return the effects of a chain's scene, at their beginning."""
         found = read_entries(chain.scene)
+        for one in chain.scene.objects:
+            if one.motion is not None:
+                raise SceneError(
+                    f"{chain.scene.path}: object {one.name!r} moves as a file says, and effects "
+                    "meet CAD that stands only; simulate with a scene in which it stands, or is "
+                    "left out"
+                )
         claimed = frozenset(name for entry, _ in found for name in entry.table.claimed)
         setting = Setting(
             scene=chain.scene,
@@ -304,7 +311,7 @@ class Simulation:
         values = {
             name: dict(columns)
             for effect, _ in self.effects
-            for name, columns in effect.values().items()
+            for name, columns in effect.values(frame.hull).items()
         }
         for (_, names), effect_s in zip(self.effects, seconds, strict=True):
             for name in names:

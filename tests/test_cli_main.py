@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers.sessions import write_ball_session
 
 from hybridve.calib.errors import HybridveError
 from hybridve.cli.main import cli
@@ -158,3 +160,19 @@ def test_a_reader_that_has_seen_enough_hears_no_complaint() -> None:
 
     assert done.stderr == ""
     assert done.stdout == "x" * 80 + "\n"
+
+
+@pytest.mark.parametrize("where", ["before", "behind"])
+def test_quiet_may_stand_before_a_command_or_behind_it(
+    where: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], run: Callable[..., int]
+) -> None:
+    session = write_ball_session(tmp_path, np.zeros((2, 3)), n_cameras=2)
+    text = session.read_text(encoding="utf-8").replace("fps = 25\n", "")  # which is warned of
+    session.write_text(text, encoding="utf-8")
+    words: list[object] = ["segment", session, "--no-progress"]
+
+    assert run(*(["-q", *words] if where == "before" else [*words, "-q"])) == 0
+
+    assert capsys.readouterr().err == ""
+    assert run(*words, "--overwrite") == 0
+    assert "fps: this key is missing" in capsys.readouterr().err

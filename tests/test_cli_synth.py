@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hybridve.hull.cad.scene import load_scene
@@ -96,11 +97,13 @@ def test_the_ball_and_the_curtain_are_sessions_with_a_scene(synth: Callable[...,
         for camera in session.cameras:
             assert camera.recording is not None
             assert camera.recording.count() == 3
-        # In the middle the hand is in the curtain; the ball is touched before that and after.
+        # In the middle the hands are in the curtain; the ball is touched before that and after.
         assert truth.objects[names[0]].collides.tolist() == [False, preset == "curtain", False]
         if preset == "curtain":
             (curtain, window) = scene.objects
             assert len(curtain.faces) == 720
+            assert len(np.unique(curtain.vertices_world, axis=0)) == 399
+            assert [effect["kind"] for effect in scene.effects] == ["cloth"]
             assert curtain.recovery_direction is not None
             assert curtain.recovery_direction.tolist() == [0.0, 1.0, 0.0]
             assert window.recovery_direction is None
@@ -116,7 +119,7 @@ def test_the_ball_and_the_curtain_are_sessions_with_a_scene(synth: Callable[...,
         (("payload", "--participant", "0"), "participant is 0, expected 1 to 4"),
         (("payload", "--gap-mm", "-10"), "gap_mm is -10, expected 60 to 400"),
         (("payload", "--gap-mm", "nan"), "gap_mm is nan, expected 60 to 400"),
-        (("payloads",), "no preset 'payloads'; one of boxes, payload, ball, curtain"),
+        (("payloads",), "no preset 'payloads'; one of boxes, payload, ball, curtain, b"),
     ],
 )
 def test_what_a_preset_does_not_have_is_refused_in_one_line(

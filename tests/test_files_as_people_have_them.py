@@ -178,4 +178,6 @@ def test_a_recording_with_names_with_spaces_goes_through_to_its_report(
         == 0
     )
     lines = (tmp_path / "back.csv").read_text(encoding="utf-8").splitlines()
-    assert sorted(line.partition(",")[0] for line in lines) == ["Camera 1", "cam0", "cam2"]
+    # COLMAP cuts names off at spaces, so they are written without.
+    names = {line.partition(",")[0] for line in lines[1:]}
+    assert names == {"Camera_1", "cam0", "cam2"}

@@ -17,7 +17,8 @@ def write_colmap_model(folder: Path, rig: Rig) -> None:
     """Write a rig as a COLMAP text model: one rig, one frame, one image a camera.
 
     The rig's first camera is COLMAP's reference sensor, so that the frame's pose is its pose.
-    Images are named after the cameras. The files are replaced one by one, each when complete.
+    Images are named after the cameras, with ``_`` for a space, at which COLMAP would cut the name
+    off. The files are replaced one by one, each when complete.
 
     Raises
     ------
@@ -46,9 +47,8 @@ def write_colmap_model(folder: Path, rig: Rig) -> None:
     frame.rig_from_world = pycolmap.Rigid3d(rig_from_world)
     model.add_frame(frame)
     for number, camera in enumerate(rig.cameras, start=1):
-        model.add_image(
-            pycolmap.Image(name=camera.name, camera_id=number, image_id=number, frame_id=1)
-        )
+        name = camera.name.replace(" ", "_")
+        model.add_image(pycolmap.Image(name=name, camera_id=number, image_id=number, frame_id=1))
     model.register_frame(1)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -142,21 +142,21 @@ class _Meeting(NamedTuple):
 def _meet(
     vertices: NDArray[np.float64], faces: NDArray[np.int32], has_area: NDArray[np.bool_]
 ) -> _Meeting:
-    places = _places(vertices, 0.0)
+    places = places_of(vertices, 0.0)
     counts, counted = _bad_edges(places[faces], has_area)
     if not has_area.any():
         return _Meeting(places, counted, counts, None)
     if not any(counts):
         return _Meeting(places, counted, counts, 0.0)
     noise = float(np.abs(vertices[faces]).max()) * 2.0**-22
-    places = _places(vertices, noise)
+    places = places_of(vertices, noise)
     bad, counted = _bad_edges(places[faces], has_area)
     # No triangle may be lost: what is as fine as the noise cannot be told from a crack.
     is_closed = not any(bad) and _has_three_corners(places[faces])[has_area].all()
     return _Meeting(places, counted, counts, noise if is_closed else None)
 
 
-def _places(vertices: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
+def places_of(vertices: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
     """Return a number for each vertex (V,): the same for coordinates that are at most so far apart.
 
     Or that are joined by others between them, each no farther from the next.
@@ -241,7 +241,7 @@ def widest_gap(vertices: NDArray[np.float64], faces: NDArray[np.int32], narrow: 
     narrow : float
         What is narrow, in the unit of the vertices.
     """
-    places = _places(vertices, 0.0)[faces]
+    places = places_of(vertices, 0.0)[faces]
     whole = _has_three_corners(places)
     places, corners = places[whole], vertices[faces[whole]]
     tails, heads = places.ravel(), np.roll(places, -1, axis=1).ravel()

@@ -148,6 +148,11 @@ class Instant:
         From that instant to this one.
     frame : int
         The number of the frame that the steps lead to.
+    recorded : (Hull, Hull) or None
+        Where the hull is interpolated, those of the frames before and after: silhouettes move by
+        whole pixels, of which the short way from `before` holds few. None where that tells as much.
+    recorded_s : float
+        From the first of these to the second.
     """
 
     time_s: float
@@ -155,6 +160,8 @@ class Instant:
     before: Hull | None
     elapsed_s: float
     frame: int
+    recorded: tuple[Hull, Hull] | None = None
+    recorded_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,10 +298,15 @@ class Effect(Protocol):
         """
         ...
 
-    def values(self) -> Mapping[str, Mapping[str, NDArray[Any]]]:
+    def values(self, hull: Hull | None) -> Mapping[str, Mapping[str, NDArray[Any]]]:
         """Return by entry and column what stands at the end of a frame: `COMMON` and its own.
 
         What is counted "since the frame before" begins anew.
+
+        Parameters
+        ----------
+        hull : Hull or None
+            Of the frame; None if it has none, so that nothing went on.
         """
         ...
 

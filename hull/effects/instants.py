@@ -94,6 +94,8 @@ def instants(
                 before=last,
                 elapsed_s=elapsed_s / n_hulls,
                 frame=frame,
+                recorded=None if before is None or n_hulls == 1 else (before, after),
+                recorded_s=elapsed_s,
             ),
             pace.n_steps,
         )

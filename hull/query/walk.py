@@ -288,7 +288,7 @@ def _unit(direction: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @compiled
-def _seen_range(
+def seen_range(
     begin: NDArray[np.float64],
     step: NDArray[np.float64],
     width: int,
@@ -332,7 +332,7 @@ def _append(begin_m: float, end_m: float, spans_m: NDArray[np.float64], n_spans:
 
 
 @compiled
-def _lines_crossed(
+def lines_crossed(
     begin_x: float,
     begin_z: float,
     step_x: float,
@@ -361,7 +361,7 @@ def _lines_crossed(
 
 
 @compiled
-def _next_crossing(
+def next_crossing(
     begin_x: float,
     begin_z: float,
     step_x: float,
@@ -396,10 +396,10 @@ def _walk_camera(
     height = len(answers) // width
     x0, y0, z0 = begin
     x1, y1, z1 = step
-    columns = _lines_crossed(x0, z0, x1, z1, width, first_m, last_m)
-    rows = _lines_crossed(y0, z0, y1, z1, height, first_m, last_m)
-    column_m, next_column = _next_crossing(x0, z0, x1, z1, columns, first_m, last_m)
-    row_m, next_row = _next_crossing(y0, z0, y1, z1, rows, first_m, last_m)
+    columns = lines_crossed(x0, z0, x1, z1, width, first_m, last_m)
+    rows = lines_crossed(y0, z0, y1, z1, height, first_m, last_m)
+    column_m, next_column = next_crossing(x0, z0, x1, z1, columns, first_m, last_m)
+    row_m, next_row = next_crossing(y0, z0, y1, z1, rows, first_m, last_m)
     at_m = first_m
     while at_m < last_m:
         until_m = min(column_m, row_m)
@@ -414,10 +414,10 @@ def _walk_camera(
         at_m = until_m
         if column_m <= at_m:
             rest = (next_column, columns[1], columns[2])
-            column_m, next_column = _next_crossing(x0, z0, x1, z1, rest, at_m, last_m)
+            column_m, next_column = next_crossing(x0, z0, x1, z1, rest, at_m, last_m)
         if row_m <= at_m:
             rest = (next_row, rows[1], rows[2])
-            row_m, next_row = _next_crossing(y0, z0, y1, z1, rest, at_m, last_m)
+            row_m, next_row = next_crossing(y0, z0, y1, z1, rest, at_m, last_m)
     return n_spans
 
 
@@ -484,7 +484,7 @@ def _walk(
     for ray in range(n_rays):
         first_m, last_m = 0.0, reach_m
         for camera in range(n_cameras):
-            seen_m[camera] = _seen_range(
+            seen_m[camera] = seen_range(
                 begin[ray, camera],
                 step[ray, camera],
                 sizes[camera, 0],

@@ -91,6 +91,8 @@ class CadPart:
         Where it gives way if it can only in one direction, in the frame of the mesh.
     comment : str
         What scene.toml says of it, a line for each line.
+    effect : str
+        The keys of the ``[[effect]]`` that moves it, a line for each line; none if empty.
     """
 
     name: str
@@ -100,6 +102,7 @@ class CadPart:
     required_clearance_mm: float = 0.0
     recovery_direction: tuple[float, float, float] | None = None
     comment: str = ""
+    effect: str = ""
 
     @property
     def world_from_mesh(self) -> Pose:

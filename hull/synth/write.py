@@ -496,4 +496,6 @@ def _write_toml(folder: Path, job: _Job) -> None:
         if part.recovery_direction is not None:
             direction = ", ".join(f"{value:g}" for value in part.recovery_direction)
             lines.append(f"recovery_direction = [{direction}]")
+        if part.effect:
+            lines += ["", "[[effect]]", *part.effect.splitlines()]
     (folder / "scene.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -69,7 +69,7 @@ class Dwell:
             self._dwell_s += step_s
             self._n_contacts += 1
 
-    def values(self):
+    def values(self, hull):
         n_contacts, self._n_contacts = self._n_contacts, 0
         return {self._name: {
             "kinetic_j": 0.0, "potential_j": 0.0, "hull_work_j": 0.0, "penetration_m": 0.0,

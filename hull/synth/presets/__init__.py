@@ -1,6 +1,7 @@
 """The recordings that can be generated, by name."""
 
 from hybridve.hull.synth.presets.ball import BALL
+from hybridve.hull.synth.presets.bounce import BOUNCE
 from hybridve.hull.synth.presets.boxes import BOXES, BOXES_PASSING_CLEARANCE_M
 from hybridve.hull.synth.presets.curtain import CURTAIN
 from hybridve.hull.synth.presets.payload import PAYLOAD
@@ -14,4 +15,5 @@ PRESETS: dict[str, Preset] = {
     "payload": PAYLOAD,
     "ball": BALL,
     "curtain": CURTAIN,
+    "bounce": BOUNCE,
 }

@@ -1,7 +1,7 @@
-"""The preset "curtain": a hand that pushes through a virtual curtain, as in figure 4 of the paper.
+"""The preset "curtain": two hands that part a virtual curtain, as in figure 4 of the paper.
 
-The curtain hangs in folds before a window frame: an open sheet of 720 triangles, as many as the
-paper's. It gives way along y, away from the person.
+The curtain hangs in folds before a window frame: an open sheet of 720 triangles and 399 vertices,
+as many as the paper's. It gives way along y, away from the person.
 """
 
 from hybridve.calib.pose import compose
@@ -23,22 +23,7 @@ _MIDDLE = (0.37, 0.26, 0.72)
 
 def make_stage() -> Stage:
     """Return the stage."""
-    x, y, z = _MIDDLE
-    # The hand is turned on edge, little finger down; its fingers lead.
-    reach = track(
-        (
-            Key(0.00, (x + 0.05, y - 0.50, z - 0.10), (0.0, 80.0, -6.0)),
-            Key(0.30, (x - 0.04, y + 0.10, z + 0.04), (0.0, 84.0, 0.0)),
-            Key(0.55, (x + 0.20, y + 0.12, z + 0.08), (0.0, 84.0, -14.0)),
-            Key(0.75, (x + 0.22, y - 0.26, z + 0.02), (0.0, 80.0, -10.0)),
-            Key(1.00, (x + 0.05, y - 0.55, z - 0.12), (0.0, 80.0, -6.0)),
-        )
-    )
-    flat = pose_at((-0.03, 0.0, 0.0))
-    hand = Actor(
-        pinching_hand("right", 0.012, rise=0.08, is_left=False),
-        lambda moment: compose(reach(moment), flat),
-    )
+    hands = (_hand("right", 1.0), _hand("left", -1.0))
     mm = tuple(1000.0 * value for value in _MIDDLE)
     return Stage(
         cameras=(
@@ -50,14 +35,15 @@ def make_stage() -> Stage:
         board=BOARD,
         room=make_room(),
         lamp=LAMP,
-        actors=(hand,),
+        actors=hands,
         parts=(
             CadPart(
                 "curtain",
-                sheet_mesh((760.0, 840.0), (24, 15), 12.0, 4),
+                sheet_mesh((760.0, 840.0), (18, 20), 12.0, 3),
                 (mm[0], mm[1], mm[2]),
                 recovery_direction=(0.0, 1.0, 0.0),
                 comment="An open sheet: it has no inside. It gives way along y only.",
+                effect='kind = "cloth"\nobject = "curtain"\nareal_density_kg_m2 = 0.2\npin = "top"',
             ),
             CadPart(
                 "window",
@@ -69,9 +55,31 @@ def make_stage() -> Stage:
     )
 
 
+def _hand(name: str, side: float) -> Actor:
+    """Return a hand on one side, 1 for right: on edge, its back outwards, the fingers lead."""
+    x, y, z = _MIDDLE
+    reach = track(
+        tuple(
+            Key(moment, (x + side * out, y + along, z + up), (0.0, side * 82.0, -side * turn))
+            for moment, out, along, up, turn in (
+                (0.00, 0.08, -0.52, -0.12, 4.0),
+                (0.28, 0.05, 0.07, -0.05, 0.0),
+                (0.58, 0.20, 0.11, -0.02, 12.0),
+                (0.78, 0.22, -0.26, -0.06, 8.0),
+                (1.00, 0.10, -0.55, -0.14, 4.0),
+            )
+        )
+    )
+    flat = pose_at((-side * 0.03, 0.0, 0.0))
+    return Actor(
+        pinching_hand(name, 0.012, rise=0.08, is_left=side < 0),
+        lambda moment: compose(reach(moment), flat),
+    )
+
+
 #: The recording.
 CURTAIN = Preset(
-    description="A hand pushes through a virtual curtain in a window, and aside, and withdraws.",
+    description="Two hands part a virtual curtain in a window, and withdraw.",
     n_frames=48,
     fps=25.0,
     make_stage=make_stage,
