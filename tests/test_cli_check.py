@@ -225,12 +225,15 @@ def test_effects_are_named_and_one_that_cannot_be_read_is_a_problem(
     whole = scene.read_text(encoding="utf-8")
     (session / "rig.csv").rename(session / "no_rig.csv")  # nothing is evaluated
 
-    scene.write_text(f'{whole}[[effect]]\nkind = "rigid"\nobject = "cube"\n', encoding="utf-8")
+    scene.write_text(
+        f'{whole}[[effect]]\nkind = "proximity"\nobject = "cube"\nzones_mm = [50]\n',
+        encoding="utf-8",
+    )
     _, named = check(session, "--scene", scene)
     scene.write_text(f'{whole}[[effect]]\nkind = "rigidd"\n', encoding="utf-8")
     _, unknown = check(session, "--scene", scene)
 
-    assert named["effects"] == ["rigid"]
+    assert named["effects"] == ["proximity"], named["problems"]
     assert unknown["effects"] == []
     assert any("there is no effect 'rigidd'" in line for line in unknown["problems"])
 
