@@ -46,6 +46,10 @@ def exif_orientation(path: Path) -> int:
     try:
         with path.open("rb") as file:
             head = file.read(_LOOKED_AT)
+            if head.startswith(_TIFF):  # its table may stand behind the picture
+                order = "<" if head.startswith(b"II") else ">"
+                file.seek(int.from_bytes(head[4:8], "little" if order == "<" else "big"))
+                head = head[:4] + struct.pack(f"{order}I", 8) + file.read(_LOOKED_AT)
     except OSError:
         return 1
     block = b""

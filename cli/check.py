@@ -174,7 +174,13 @@ def _tell_looks(found: "SessionCheck") -> None:
 def _tell_rig(found: "SessionCheck") -> None:
     if found.rig == "none":
         if not found.problems:
-            click.echo("there is no rig yet: `hybridve calibrate` comes first")
+            has_board = any(camera.source("extrinsics") for camera in found.cameras)
+            way = (
+                "`hybridve calibrate` comes first"
+                if has_board
+                else "name one with rig =, or record a board (extrinsics) and calibrate"
+            )
+            click.echo(f"there is no rig yet: {way}")
         return
     click.echo(f"rig: {_RIGS.get(found.rig, found.rig)}")
     if found.rig == "not looked at":

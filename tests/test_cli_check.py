@@ -165,7 +165,7 @@ def test_a_session_that_cannot_be_loaded_is_one_line(session: Path, check: Check
     assert "did you mean fps" in line
 
 
-def test_without_a_rig_calibrating_comes_first(
+def test_without_a_rig_it_is_told_what_comes_first(
     session: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = session / "session.toml"
@@ -174,7 +174,7 @@ def test_without_a_rig_calibrating_comes_first(
 
     assert run("check", session, "--strict") == 0
 
-    assert "there is no rig yet: `hybridve calibrate` comes first" in capsys.readouterr().out
+    assert "there is no rig yet: name one with rig =" in capsys.readouterr().out
 
 
 @pytest.mark.slow  # a part is evaluated in a few frames
