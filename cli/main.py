@@ -10,11 +10,14 @@ from typing import NoReturn
 import click
 
 from hybridve.calib.errors import HybridveError
+from hybridve.cli.board import board
 from hybridve.cli.calibrate import calibrate
+from hybridve.cli.check import check
 from hybridve.cli.convert import convert
 from hybridve.cli.demo import demo
 from hybridve.cli.detect import detect
 from hybridve.cli.doctor import doctor
+from hybridve.cli.init import init
 from hybridve.cli.render import render
 from hybridve.cli.segment import segment
 from hybridve.cli.simulate import simulate
@@ -60,7 +63,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 
 for command in (
-    *(demo, synth, calibrate, convert, segment, detect),
+    *(demo, synth, init, board, check, calibrate, convert, segment, detect),
     *(spacing, sweep, simulate, summary, render, doctor),
 ):
     cli.add_command(command)

@@ -267,6 +267,25 @@ def load_session(path: Path) -> Session:
     )
 
 
+def load_targets(path: Path) -> tuple[TargetTable, ...]:
+    """Return the boards that a session.toml, or the one in a folder, describes; nothing else of it.
+
+    Raises
+    ------
+    SessionError
+        If it describes none, or not well.
+    """
+    if path.is_dir():
+        path = path / "session.toml"
+    table, _ = read_toml(path, "session", SessionError)
+    targets = _parse_targets(table.get("target", []), path)
+    if not targets:
+        raise SessionError(
+            f"{path}: target: this table is missing; describe the board (kind, columns, rows, ...)"
+        )
+    return targets
+
+
 def _parse_targets(found: Any, path: Path) -> tuple[TargetTable, ...]:
     is_one = isinstance(found, dict)
     tables = [found] if is_one else found
