@@ -1,6 +1,8 @@
 """Boards that are not what was said of them: seen to be larger, or named for what they are."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +13,9 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.beyond import lines_beyond
 from hybridve.calib.boards.board import Board
+from hybridve.calib.boards.corners_io import read_given
 from hybridve.calib.boards.markers import AprilGrid, Charuco
+from hybridve.calib.boards.named import make_board
 from hybridve.calib.boards.suggest import what_is_seen
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
@@ -93,7 +97,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> CameraInput:
     """Pictures of `TRUE`, moved before one camera."""
     folder = tmp_path_factory.mktemp("recorded")
     for index, pose in enumerate(board_poses(TRUE, 4, 5)):
-        image = render_board(camera_of(), TRUE, pose, samples=2)
+        image = render_board(camera_of(size_px=(240, 180)), TRUE, pose, samples=3)
         cv2.imwrite(str(folder / f"{index}.png"), image)
     return CameraInput("cam", "SIMPLE_RADIAL", None, open_source(folder, "*.png"))
 
@@ -224,3 +228,76 @@ def test_nothing_is_named_where_nothing_is_seen() -> None:
     noise = np.random.default_rng(2).integers(90, 160, (240, 320)).astype(np.uint8)
 
     assert what_is_seen(TRUE, [noise]) is None
+
+
+# --- In another unit -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        (
+            {"kind": "chessboard", "square_mm": 0.024},
+            "square_mm = 0.024: squares measure 1 to 2000 mm, and lengths are in millimetres; is "
+            "it in metres? say square_mm = 24",
+        ),
+        ({"kind": "chessboard", "square_mm": 0.1}, "say square_mm = 100"),
+        ({"kind": "chessboard", "square_mm": (0.1, 0.101)}, "say square_mm = [100, 101]"),
+        ({"kind": "chessboard", "square_mm": 24000}, "in micrometres? say square_mm = 24"),
+        (
+            {"kind": "charuco", "square_mm": 0.08, "marker_mm": 0.06},
+            "say square_mm = 80, marker_mm = 60",
+        ),
+        ({"kind": "charuco", "square_mm": 80, "marker_mm": 0.06}, "say marker_mm = 60"),
+        ({"kind": "aprilgrid", "tag_mm": 0.088, "gap_mm": 0.0264}, "say tag_mm = 88"),
+        ({"kind": "aprilgrid", "tag_mm": 88, "gap_mm": 0.0264}, "say gap_mm = 26.4"),
+    ],
+)
+def test_lengths_in_another_unit_are_refused_with_the_likely_value(
+    said: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(CalibrationError) as refused:
+        make_board({"columns": 8, "rows": 6, **said})
+
+    assert str(refused.value).endswith(told)
+
+
+@pytest.mark.parametrize("square_mm", [1, 2.4, 115, 2000])
+def test_squares_that_are_printed_are_taken(square_mm: float) -> None:
+    board = make_board({"kind": "chessboard", "columns": 8, "rows": 6, "square_mm": square_mm})
+
+    assert board.square_m == pytest.approx(square_mm / 1000)
+
+
+# --- Numbered by others ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_part", [False, True])
+@pytest.mark.parametrize("tilt_deg", [5.0, 35.0])
+def test_corners_of_a_charuco_board_are_taken_as_opencv_numbers_them(
+    tmp_path: Path, is_part: bool, tilt_deg: float
+) -> None:
+    camera = camera_of(size_px=(640, 480))
+    pixels = img_from_cam(camera, transform(facing(CHARUCO, 0.9, tilt_deg), CHARUCO.points_board))
+    columns, rows = CHARUCO.columns - 1, CHARUCO.rows - 1
+    seen = [k for k in range(columns * rows) if not is_part or k % 3]
+    numbers = {
+        "ours": seen,
+        "opencv": [(rows - 1 - k // columns) * columns + k % columns for k in seen],
+    }
+
+    read = {}
+    for whose, listed in numbers.items():
+        path = tmp_path / f"{whose}.csv"
+        lines = [
+            f"0,{number},{pixels[k, 0] - 0.5:.9f},{pixels[k, 1] - 0.5:.9f}"
+            for k, number in zip(seen, listed, strict=True)
+        ]
+        path.write_text("\n".join(["frame,corner,x,y", *lines]) + "\n", encoding="utf-8")
+        (given,) = read_given(path, [CHARUCO])
+        read[whose] = given.pixels
+
+    expected = np.full_like(pixels, np.nan)
+    expected[seen] = pixels[seen]
+    np.testing.assert_allclose(read["ours"], expected, atol=1e-8)  # nine digits are written
+    np.testing.assert_allclose(read["opencv"], expected, atol=1e-8)

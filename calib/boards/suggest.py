@@ -31,6 +31,9 @@ _LEAST_MARKERS = 5
 #: Dictionaries of so many markers are looked through, where a family has a smaller one.
 _COMMON = 250
 
+#: Corners of a board of unknown size that are no accident.
+_LEAST_CORNERS = 12
+
 #: Most squares or tags along a side that are thought of.
 _MOST_COLUMNS = 40
 
@@ -92,7 +95,7 @@ def what_is_seen(board: Board, pictures: Sequence[NDArray[Any]]) -> str | None:
     for search in reversed(searches) if isinstance(board, Chessboard) else searches:
         for grey in greys:
             seen = search(board, grey)
-            if seen is not None:
+            if seen is not None and _changed(board, seen):
                 return _told(board, seen)
     return None
 
@@ -416,19 +419,35 @@ def _margin(
 
 
 def _seen_chessboard(board: _Known, grey: NDArray[np.uint8]) -> Chessboard | None:
-    """Return the chessboard of another number of corners that a picture shows, if it shows one."""
-    wrong_by = [(-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2)]
+    """Return the chessboard that a picture shows, by how many corners it has; None if it has none.
+
+    OpenCV's search for boards of any size finds some in part, and what goes on beyond is added. It
+    misses some that a search for the right size finds: the usual mistakes are tried.
+    """
+    tried = []
+    if min(grey.shape) > 40:
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
+        if found and meta.size >= _LEAST_CORNERS:
+            tried.append(meta.shape[::-1])
     if not isinstance(board, Chessboard):
-        wrong_by.insert(0, (0, 0))
-    for more_columns, more_rows in wrong_by:
-        if min(board.columns + more_columns, board.rows + more_rows) < 3:
+        tried.append((board.columns, board.rows))
+    tried += [
+        (board.columns + columns, board.rows + rows)
+        for columns, rows in ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1))
+    ]
+    for columns, rows in tried:
+        if min(columns, rows) < 3:
             continue
-        other = Chessboard(board.columns + more_columns, board.rows + more_rows, board.square_m)
-        found = other.detect(grey, "quick")
-        if found.corners is not None:
-            return replace(
-                other, columns=other.columns + found.beyond[0], rows=other.rows + found.beyond[1]
-            )
+        other = Chessboard(columns, rows, board.square_m)
+        corners = other.detect(grey, "quick")
+        if corners.corners is None:
+            continue
+        count = columns + corners.beyond[0], rows + corners.beyond[1]
+        # A chessboard is found whichever way it lies; columns are told as they were.
+        if (count[0] < count[1]) != (board.columns < board.rows):
+            count = count[::-1]
+        if not isinstance(board, Chessboard) or count != (board.columns, board.rows):
+            return Chessboard(*count, board.square_m)
     return None
 
 
@@ -437,8 +456,7 @@ def _seen_chessboard(board: _Known, grey: NDArray[np.uint8]) -> Chessboard | Non
 
 def _told(board: Board, seen: Board) -> str:
     """Return what board is seen, and what to change in the description of another."""
-    said, wanted = _keys(board), _keys(seen)
-    changed = {key: value for key, value in wanted.items() if said.get(key) != value}
+    said, changed = _keys(board), _changed(board, seen)
     if isinstance(seen, Chessboard):
         hint = ""
         if isinstance(board, Chessboard) and (
@@ -447,7 +465,7 @@ def _told(board: Board, seen: Board) -> str:
             hint = " (columns and rows count the corners inside the board, not its squares)"
         return (
             f"a chessboard of {seen.columns}x{seen.rows} inner corners is seen{hint}: say "
-            f"{_listed(changed)}"
+            f"{_listed(changed)}" + (" if it has no markers" if isinstance(board, Charuco) else "")
         )
     if len(changed) == 1 and "dictionary" in changed:
         what = f"markers of {changed['dictionary']} are seen"
@@ -456,6 +474,12 @@ def _told(board: Board, seen: Board) -> str:
         if isinstance(seen, Charuco | AprilGrid) and said.get("dictionary") != seen.dictionary:
             what = f"{seen}, of {seen.dictionary}, is seen"
     return f"{what}: say {_listed(changed)}"
+
+
+def _changed(board: Board, seen: Board) -> dict[str, str | int | float]:
+    """Return what a session says of a board that is seen and does not say of the other."""
+    said = _keys(board)
+    return {key: value for key, value in _keys(seen).items() if said.get(key) != value}
 
 
 def _keys(board: Board) -> dict[str, str | int | float]:

@@ -10,7 +10,7 @@ patterns*, IEEE Trans. PAMI 13(4), 1991.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -34,6 +34,9 @@ _SCALE_REFUSED = 0.2
 #: they lie in a plane, where a mirror image is a turn.
 _LINE = 1e-2
 _FLAT = 2e-2
+
+#: Cameras that are all nearer to the board than this are doubted.
+_SMALL_M = 0.05
 
 #: Boards in several planes mirror a camera to places that are further apart than this share of how
 #: far it is behind the first.
@@ -134,12 +137,32 @@ def place_world(
         Naming what does not fit: points, or cameras that came out under the floor.
     """
     if kind == "points":
-        return place_by_points(cameras, [mark for mark in marks if mark.xyz_m is not None])
-    if kind == "floor":
-        return place_on_floor(cameras, seen, [mark for mark in marks if mark.is_floor])
-    if kind == "board":
-        return place_by_board(cameras, seen)
-    raise ValueError(f"unknown kind of world {kind!r}")
+        placed = place_by_points(cameras, [mark for mark in marks if mark.xyz_m is not None])
+    elif kind == "floor":
+        placed = place_on_floor(cameras, seen, [mark for mark in marks if mark.is_floor])
+    elif kind == "board":
+        placed = place_by_board(cameras, seen)
+    else:
+        raise ValueError(f"unknown kind of world {kind!r}")
+    told = placed.told
+    return replace(
+        placed, told=replace(told, warnings=(*told.warnings, *_told_small(cameras, seen)))
+    )
+
+
+def _told_small(cameras: Sequence[Camera], seen: SeenBoards) -> list[str]:
+    """Tell cameras that came out nearer to each other and to the board than cameras are built."""
+    pose, board, _ = seen.main()
+    middle = transform(seen.rig_from_board(pose, board), seen.boards[board].center_board[None])[0]
+    centers = np.array([camera.center_world for camera in cameras])
+    reach_m = float(np.linalg.norm(centers - middle, axis=1).max())
+    if reach_m >= _SMALL_M:
+        return []
+    square_mm = 1000.0 * seen.boards[board].square_m
+    return [
+        f"all cameras came out within {1000 * reach_m:.0f} mm of the board: is its square of "
+        f"{square_mm:g} mm told in millimetres? of as many centimetres, it has {10 * square_mm:g}"
+    ]
 
 
 def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:

@@ -49,6 +49,10 @@ _SPREAD_FRAMES = 9
 _STILL_GREY = 8.0
 
 
+#: Averages in which another board is looked for where none is found.
+_AVERAGES = 4
+
+
 #: Bytes of grey frames of one clip held at once; larger images are averaged over fewer frames.
 _CLIP_BYTES = 200_000_000
 
@@ -183,7 +187,9 @@ def observe_clips(
                     f"camera {clip.camera.name!r}: {listed_boards(search.boards)} found in "
                     f"{clip.source.label}"
                     + (
-                        _seen_instead(search, clip)
+                        _seen_instead(
+                            search, clip, [clip, *(one for one in clips if one is not clip)]
+                        )
                         or f" (average of {clip.n_frames} frames; {still.tried}); check columns "
                         "and rows, or mark the corners by hand (`corners`)"
                     )
@@ -210,12 +216,17 @@ def observe_clips(
     ]
 
 
-def _seen_instead(search: Search, clip: _Clip) -> str:
-    """Return what a clip shows in place of the boards, to follow what it does not; or nothing."""
+def _seen_instead(search: Search, clip: _Clip, averages: Sequence[_Clip] = ()) -> str:
+    """Return what a clip shows in place of the boards, to follow what it does not; or nothing.
+
+    Of still boards the average is looked at first, and that of other clips, which may see better.
+    """
     frames = clip.frames
-    chosen = sorted({0, len(frames) // 3, 2 * len(frames) // 3, len(frames) - 1})
+    chosen = sorted({0, len(frames) // 2, len(frames) - 1})
+    pictures: list[NDArray[Any]] = [one.picture for one in averages[:_AVERAGES]]
+    pictures += [frames[index] for index in chosen]
     for board in search.boards:
-        seen = what_is_seen(board, [frames[index] for index in chosen])
+        seen = what_is_seen(board, pictures)
         if seen is not None:
             which = f"for board {board.name!r}, " if len(search.boards) > 1 else ""
             return f": {which}{seen}"
