@@ -1,5 +1,6 @@
 """Boards that are not what was said of them: seen to be larger, or named for what they are."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,22 +8,24 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers.boards import board_poses, make_camera, render_board
-from helpers.marker_boards import april_sheet, charuco_sheet, render_sheets
+from helpers.boards import board_poses, look_at, make_camera, render_board
+from helpers.marker_boards import april_sheet, charuco_sheet, project_board, render_sheets
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.beyond import lines_beyond
-from hybridve.calib.boards.board import Board
+from hybridve.calib.boards.board import Board, Observations, Sighting
 from hybridve.calib.boards.corners_io import read_given
 from hybridve.calib.boards.markers import AprilGrid, Charuco
 from hybridve.calib.boards.named import make_board
 from hybridve.calib.boards.suggest import what_is_seen
 from hybridve.calib.boards.target import Chessboard
+from hybridve.calib.calibrate import solve_rig
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import open_source
+from hybridve.calib.judging.certificate import working_volume
 from hybridve.calib.lens import img_from_cam
-from hybridve.calib.pose import rotation_about_axes, transform
+from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes, transform
 from hybridve.calib.seeing.inputs import CameraInput, ObserveSettings
 from hybridve.calib.seeing.observe import find_boards, observe_boards
 
@@ -228,6 +231,59 @@ def test_nothing_is_named_where_nothing_is_seen() -> None:
     noise = np.random.default_rng(2).integers(90, 160, (240, 320)).astype(np.uint8)
 
     assert what_is_seen(TRUE, [noise]) is None
+
+
+# --- Seen from its back ----------------------------------------------------------------------
+
+
+def through_glass(cameras: Sequence[Camera], poses: Sequence[Pose]) -> list[Observations]:
+    """Return what cameras on both sides of a printed glass see of it: all of it, everywhere."""
+    return [
+        Observations(
+            camera.name,
+            camera.model,
+            (camera.width_px, camera.height_px),
+            tuple(
+                Sighting(
+                    f"board clip, frame {instant}",
+                    instant,
+                    0,
+                    project_board(camera, compose(camera.cam_from_world, pose), CHARUCO),
+                )
+                for instant, pose in enumerate(poses)
+            ),
+            False,
+        )
+        for camera in cameras
+    ]
+
+
+@pytest.mark.slow
+def test_cameras_on_both_sides_of_a_printed_glass_stand_where_they_are() -> None:
+    cameras = [
+        make_camera(f"cam{number}", "SIMPLE_RADIAL", look_at((x, y, z), (0.0, 0.0, 1.0)))
+        for number, (x, y, z) in enumerate(
+            [(1.4, 0.5, 1.2), (1.4, -0.5, 1.3), (-1.4, 0.5, 1.1), (-1.4, -0.5, 1.4)], start=1
+        )
+    ]
+    rng = np.random.default_rng(5)
+    upright = rotation_about_axes((90.0, 0.0, 90.0))  # its printed side towards the first two
+    poses = []
+    for _ in range(14):
+        turn = upright @ rotation_about_axes(tuple(rng.uniform(-25, 25, 3)))
+        middle = np.array([0.0, 0.0, 1.0]) + rng.uniform(-0.2, 0.2, 3)
+        poses.append(np.column_stack([turn, middle - turn @ CHARUCO.center_board]))
+
+    calibration = solve_rig([CHARUCO], through_glass(cameras, poses))
+
+    world_from_room = invert(poses[0])
+    true = transform(world_from_room, np.array([camera.center_world for camera in cameras]))
+    np.testing.assert_allclose(calibration.rig.centers_world, true, atol=1e-4)  # m; no noise
+    assert (true[:2, 2] > 0).all()
+    assert (true[2:, 2] < 0).all()
+    # The volume that they are judged in is on both sides of the sheet.
+    volume = working_volume(calibration.rig)
+    assert volume.low_world[2] < 0 < volume.high_world[2]
 
 
 # --- In another unit -------------------------------------------------------------------------
