@@ -203,6 +203,31 @@ def test_markers_that_are_counted_from_another_number_are_told() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("way", ["mirrored", "negative"])
+def test_a_board_that_is_turned_and_wrongly_described_is_named(
+    charuco: NDArray[np.uint8], way: str
+) -> None:
+    turned = np.fliplr(charuco) if way == "mirrored" else 255 - charuco
+
+    seen = what_is_seen(replace(CHARUCO, dictionary="DICT_6X6_250"), [turned])
+
+    assert seen is not None
+    assert seen.endswith('say dictionary = "DICT_4X4_50"')
+
+
+def test_a_part_of_a_board_tells_its_dictionary_and_leaves_its_rows(
+    charuco: NDArray[np.uint8],
+) -> None:
+    covered = charuco.copy()
+    covered[300:] = 120
+
+    seen = what_is_seen(replace(CHARUCO, dictionary="DICT_5X5_250"), [covered])
+
+    assert seen is not None
+    assert seen.endswith('say dictionary = "DICT_4X4_50"')
+
+
+@pytest.mark.slow
 def test_a_grid_of_tags_is_named_for_what_it_is(april: NDArray[np.uint8]) -> None:
     wider = what_is_seen(replace(APRIL, columns=2, rows=3), [april])
     other_gap = what_is_seen(replace(APRIL, gap_m=0.06), [april])
@@ -211,7 +236,7 @@ def test_a_grid_of_tags_is_named_for_what_it_is(april: NDArray[np.uint8]) -> Non
     assert wider is not None
     assert wider.endswith("say columns = 3, rows = 2")
     assert other_gap is not None
-    assert other_gap.endswith("say gap_mm = 30")
+    assert other_gap.endswith("say gap_mm = 30 (or tag_spacing = 0.3 in place of gap_mm)")
     assert other_kind is not None
     assert 'say kind = "aprilgrid", columns = 3, rows = 2' in other_kind
     assert "gap_mm = 30" in other_kind

@@ -5,7 +5,7 @@ their size; plain boards are tried by the mistakes that people make in counting.
 believed where that board is then found, by the search that any board is found by.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -23,7 +23,7 @@ from hybridve.calib.errors import CalibrationError
 _Known = Chessboard | Charuco | AprilGrid
 
 #: Pictures are looked at in at most this many pixels along the longer side.
-_SIZE_PX = 1600
+_SIZE_PX = 1200
 
 #: Markers of one family in one picture that are no accident.
 _LEAST_MARKERS = 5
@@ -88,15 +88,26 @@ def what_is_seen(board: Board, pictures: Sequence[NDArray[Any]]) -> str | None:
     str or None
         One sentence without a full stop; None where no other board is seen either.
     """
-    greys = [_small(picture) for picture in pictures]
     if not isinstance(board, Chessboard | Charuco | AprilGrid):
         return None
-    searches = [_seen_markers, _seen_chessboard]
-    for search in reversed(searches) if isinstance(board, Chessboard) else searches:
-        for grey in greys:
-            seen = search(board, grey)
-            if seen is not None and _changed(board, seen):
-                return _told(board, seen)
+    greys = [_small(picture) for picture in pictures]
+    attempts: list[tuple[Callable[[_Known, NDArray[np.uint8]], _Known | None], NDArray[np.uint8]]]
+    chessboards = [(_seen_chessboard, grey) for grey in greys]
+    markers = [(_seen_markers, grey) for grey in greys]
+    if isinstance(board, Chessboard):
+        attempts = [*chessboards, *markers]
+    else:
+        # In a negative, and from its back: the search for the board itself knows both.
+        turned = [
+            (_seen_markers, other)
+            for grey in greys[:1]
+            for other in (np.asarray(255 - grey, np.uint8), np.ascontiguousarray(np.fliplr(grey)))
+        ]
+        attempts = [*markers, *turned, *chessboards]
+    for search, grey in attempts:
+        seen = search(board, grey)
+        if seen is not None and _changed(board, seen):
+            return _told(board, seen)
     return None
 
 
@@ -266,7 +277,7 @@ def _rows(board: _Known, layout: _Layout, count: int) -> list[int]:
         likely.append(board.rows)
     if layout.columns == board.rows:
         likely.append(board.columns)
-    rows = [number for number in likely if least <= number <= least + 1]
+    rows = [number for number in likely if number >= least]  # the rest may be out of view
     return list(dict.fromkeys([*rows, least, least + 1]))
 
 
@@ -473,7 +484,10 @@ def _told(board: Board, seen: Board) -> str:
         what = f"{seen} is seen"
         if isinstance(seen, Charuco | AprilGrid) and said.get("dictionary") != seen.dictionary:
             what = f"{seen}, of {seen.dictionary}, is seen"
-    return f"{what}: say {_listed(changed)}"
+    told = f"{what}: say {_listed(changed)}"
+    if isinstance(seen, AprilGrid) and "gap_mm" in changed:
+        told += f" (or tag_spacing = {seen.gap_m / seen.tag_m:.3g} in place of gap_mm)"
+    return told
 
 
 def _changed(board: Board, seen: Board) -> dict[str, str | int | float]:

@@ -221,16 +221,24 @@ def _seen_instead(search: Search, clip: _Clip, averages: Sequence[_Clip] = ()) -
 
     Of still boards the average is looked at first, and that of other clips, which may see better.
     """
-    frames = clip.frames
-    chosen = sorted({0, len(frames) // 2, len(frames) - 1})
-    pictures: list[NDArray[Any]] = [one.picture for one in averages[:_AVERAGES]]
-    pictures += [frames[index] for index in chosen]
-    for board in search.boards:
-        seen = what_is_seen(board, pictures)
-        if seen is not None:
-            which = f"for board {board.name!r}, " if len(search.boards) > 1 else ""
-            return f": {which}{seen}"
-    return ""
+
+    def look() -> Answer:
+        frames = clip.frames
+        chosen = sorted({0, len(frames) // 2, len(frames) - 1})
+        pictures: list[NDArray[Any]] = [one.picture for one in averages[:_AVERAGES]]
+        pictures += [frames[index] for index in chosen]
+        for board in search.boards:
+            seen = what_is_seen(board, pictures)
+            if seen is not None:
+                which = f"for board {board.name!r}, " if len(search.boards) > 1 else ""
+                return {"said": f": {which}{seen}"}, None
+        return {"said": ""}, None
+
+    keys = [part for one in (clip, *averages[:_AVERAGES]) for part in one.key]
+    asked = [
+        part for board in range(len(search.boards)) for part in search.question((), board, "quick")
+    ]
+    return str(search.cache.recall((*keys, *asked, "seen instead"), look)[0]["said"])
 
 
 def _observe_still_clip(search: Search, clip: _Clip, given: Given) -> Observations | _Unseen:
