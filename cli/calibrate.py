@@ -332,6 +332,7 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
     record = _record_of(rig)
     if certificate is not None:
         click.echo(certificate.verdict)
+        click.echo(f"  {_volume_text(certificate)}")
     click.echo(f"{path}: {len(rig.cameras)} cameras")
     certified = {} if certificate is None else {one.name: one for one in certificate.cameras}
     for camera in rig.cameras:
@@ -361,6 +362,19 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
             click.echo(f"  {opinion_text(certificate.second_opinion)}")
         for warning in certificate.warnings:
             click.echo(f"  {warning}")
+
+
+def _volume_text(certificate: "Certificate") -> str:
+    """Return where the working volume lies that a verdict speaks of."""
+    sides = ", ".join(
+        f"{axis} {low:.2f} to {high:.2f}"
+        for axis, low, high in zip(
+            "xyz", certificate.volume_low_m, certificate.volume_high_m, strict=True
+        )
+    )
+    return (
+        f"the working volume: {sides} m, as far as {certificate.volume_min_cameras} cameras see it"
+    )
 
 
 def _views_of(told: "CameraRecord | None") -> list[str]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from helpers.boards import turned_about
@@ -348,3 +349,21 @@ def test_a_charuco_rig_misses_by_less_than_its_publisher_accepts(recordings: Pat
     for camera, known_mm in ((second, (-18.6, 32.4, 3.6)), (third, (18.9, 32.5, 3.4))):
         in_first = first.cam_from_world @ np.append(camera.center_world, 1.0)
         np.testing.assert_allclose(in_first, np.array(known_mm) / 1000.0, atol=0.0015)
+
+
+@pytest.mark.slow
+def test_horseman_s_board_is_seen_to_be_larger_than_7_columns_and_not_than_8(
+    recordings: Path,
+) -> None:
+    stills = sorted((recordings / "horseman").glob("cam*/intrinsics_frames/*.jpg"))[::16]
+    pictures = [cv2.imread(str(path)) for path in stills]
+
+    def beyond(board: Chessboard) -> list[tuple[int, int]]:
+        found = [board.detect(picture, "quick") for picture in pictures if picture is not None]
+        return [one.beyond for one in found if one.corners is not None]
+
+    true, smaller = beyond(HORSEMAN), beyond(Chessboard(7, 6, 0.115))
+
+    assert set(true) == {(0, 0)}
+    assert len(true) > 5
+    assert 2 * smaller.count((1, 0)) > len(smaller) > 0

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.boards import make_camera, ring
+from helpers.boards import look_at, make_camera, ring
 from helpers.recorded_boards import random_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +27,7 @@ from hybridve.calib.placing.world import (
     place_world,
 )
 from hybridve.calib.plain import to_plain
-from hybridve.calib.pose import Pose, compose, invert, transform
+from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes, transform
 from hybridve.calib.solving.bundle import BundleView
 
 EXACT_M = 1e-8
@@ -154,6 +154,67 @@ def test_a_camera_behind_a_board_that_others_see_is_a_warning() -> None:
 
     (warning,) = placed.told.warnings
     assert "'cam2' stands 1.15 m behind" in warning
+
+
+def _on_both_sides() -> list[Camera]:
+    """Two cameras before a board and one that looks at its back."""
+    cameras = in_rig(np.eye(3, 4))
+    behind = cameras[1].center_world * [1.0, 1.0, -1.0]
+    cameras[1] = replace(
+        cameras[1], cam_from_world=look_at((behind[0], behind[1], behind[2]), ORIGIN)
+    )
+    return cameras
+
+
+ORIGIN = (0.0, 0.0, 0.0)
+TILTED = [rotation_about_axes((12.0 * k, -9.0 * k, 0.0)) for k in range(3)]
+
+
+def test_cameras_on_both_sides_of_a_sheet_that_is_moved_are_where_they_are() -> None:
+    poses = [np.column_stack([turn, [0.1 * k, 0.0, 0.0]]) for k, turn in enumerate(TILTED)]
+
+    placed = place_by_board(_on_both_sides(), lying(poses, [0, 1, 2], [[0, 1, 2]] * 3))
+
+    assert_same(placed, np.eye(3, 4))
+    assert not placed.told.warnings
+
+
+def test_a_sheet_that_is_slid_in_its_plane_tells_no_back_from_a_mirrored_picture() -> None:
+    poses = [np.column_stack([np.eye(3), [0.1 * k, 0.0, 0.0]]) for k in range(3)]
+
+    with pytest.raises(CalibrationError, match=r"'cam2'.*move and tilt the board"):
+        place_by_board(_on_both_sides(), lying(poses, [0, 1, 2], [[0, 1, 2]] * 3))
+
+
+def test_what_one_camera_alone_saw_of_a_chessboard_tells_no_side() -> None:
+    alone = [np.column_stack([turn, [0.0, 0.0, 0.0]]) for turn in TILTED[1:]]
+
+    with pytest.raises(CalibrationError, match=r"'cam2'.*under the floor"):
+        place_by_board(
+            _on_both_sides(),
+            lying([np.eye(3, 4), *alone], [0, "a.png", "b.png"], [[0, 1, 2], [1], [1]]),
+        )
+
+
+def test_cameras_a_finger_from_the_board_are_doubted() -> None:
+    """Lengths told in metres, or in centimetres, where millimetres are asked for."""
+    small = Chessboard(7, 6, 0.002)
+    near = ring(small, ["OPENCV"] * 3, 0.03)
+    near = [
+        replace(
+            camera,
+            cam_from_world=look_at((camera.center_world[0], camera.center_world[1], 0.02), ORIGIN),
+        )
+        for camera in near
+    ]
+    seen = replace(lying([np.eye(3, 4)], [0], [[0, 1, 2]]), boards=[small])
+
+    (warning,) = place_world("board", near, seen).told.warnings
+
+    assert "within 36 mm of the board" in warning
+    assert "20" in warning
+    far = in_rig(np.eye(3, 4))
+    assert not place_world("board", far, lying([np.eye(3, 4)], [0], [[0, 1, 2]])).told.warnings
 
 
 def _flip(z: bool) -> Pose:

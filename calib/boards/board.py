@@ -30,11 +30,15 @@ class Detection:
         The way in which they were found, or all ways that were tried in vain.
     notes : tuple of str
         What is unusual about this board in this image: "mirrored: seen from the back", "inverted".
+    beyond : (columns, rows)
+        How many columns and rows of corners go on beyond those of a chessboard: it is larger than
+        described.
     """
 
     corners: NDArray[np.float64] | None
     how: str
     notes: tuple[str, ...] = ()
+    beyond: tuple[int, int] = (0, 0)
 
 
 class Board(Protocol):
@@ -102,12 +106,15 @@ class Sighting:
         Which of the session's boards.
     pixels : (N, 2) float64
         The board's points in pixels, pixel centre at 0.5; NaN where one was not seen.
+    beyond : (columns, rows)
+        As `Detection.beyond`.
     """
 
     image: str
     instant: int | None
     board: int
     pixels: NDArray[np.float64]
+    beyond: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,9 +4,9 @@ A CSV with a header may say of each point in which image it lies: ``image`` (a f
 as much of its folders as makes it unique; "frame 3" of stills that are a video) or ``frame`` (of
 the extrinsic clip, from 0); to which ``board`` it belongs, by name; and which ``corner`` of that
 board it is, from 0, in the order of `Board.points_board`. Corners that are not named were not
-seen. Without ``corner``, all of a board's points are expected in their order. Files of OpenCV, and
-CSV files that name no image, hold the points of one board in the extrinsic clip, see
-`read_corners`.
+seen. Those of a ChArUco board may be numbered as OpenCV does, from the top left. Without
+``corner``, all of a board's points are expected in their order. Files of OpenCV, and CSV files that
+name no image, hold the points of one board in the extrinsic clip, see `read_corners`.
 
 All of them are understood as OpenCV counts: the centre of the top-left pixel is at (0, 0).
 """
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board
 from hybridve.calib.boards.corner_files import read_corners
-from hybridve.calib.boards.target import Chessboard, list_corners
+from hybridve.calib.boards.markers import Charuco
+from hybridve.calib.boards.target import Chessboard, fit_homography, list_corners
 from hybridve.calib.errors import CalibrationError
 
 _COLUMNS = ("image", "frame", "board", "corner", "x", "y")
@@ -165,10 +166,12 @@ def _assemble(
         if np.isfinite(pixels[corner]).all():
             raise CalibrationError(f"{place}: corner {corner} is given twice")
         pixels[corner] = point
-    return pixels
+    return _from_bottom_left(board, pixels) if isinstance(board, Charuco) else pixels
 
 
 def _in_order(board: Board, corners: NDArray[np.float64], place: str) -> NDArray[np.float64]:
+    if isinstance(board, Charuco):
+        return _from_bottom_left(board, corners)
     if not isinstance(board, Chessboard):
         return corners
     listed = list_corners(board, corners)
@@ -178,3 +181,25 @@ def _in_order(board: Board, corners: NDArray[np.float64], place: str) -> NDArray
             f"{board.columns} a row"
         )
     return listed
+
+
+def _from_bottom_left(board: Charuco, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return corners (N, 2) as we number them, of those numbered so or as OpenCV does.
+
+    From the bottom left columns turn counterclockwise into rows in a picture, from OpenCV's top
+    left clockwise. (So they do, numbered as ours, on a sheet that is seen from its back; the search
+    finds such sheets, and files of them are not known.)
+    """
+    seen = np.isfinite(pixels[:, 0])
+    if seen.sum() < 4:
+        return pixels
+    points = board.points_board[seen][:, :2] / board.sides_m
+    img_from_board = fit_homography(points, pixels[seen])
+    if img_from_board is None:
+        return pixels
+    # How the map turns near the middle: its derivative's determinant has this sign.
+    depth = float(img_from_board[2] @ np.append(points.mean(axis=0), 1.0))
+    if float(np.linalg.det(img_from_board)) * depth < 0:
+        return pixels  # y runs down in a picture: counterclockwise
+    rows = pixels.reshape(board.rows - 1, board.columns - 1, 2)
+    return np.ascontiguousarray(rows[::-1].reshape(-1, 2))

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.boards.beyond import lines_beyond
 from hybridve.calib.boards.board import Detection as Detection
 from hybridve.calib.boards.board import Effort
 from hybridve.calib.boards.symmetry import SYMMETRY_BLUR_PX, move_to_symmetry
@@ -232,7 +233,8 @@ def detect_corners(
         exact = np.array([search.shape[1] / grey.shape[1], search.shape[0] / grey.shape[0]])
         corners = refine_corners(grey, board, (found + 0.5) / exact)
         if corners is not None:
-            return Detection(corners, way)
+            grid = corners.reshape(board.rows, board.columns, 2)
+            return Detection(corners, way, beyond=lines_beyond(grey, grid))
     return Detection(None, "tried " + ", ".join(tried))
 
 

@@ -245,7 +245,7 @@ def working_volume(
     box_world : two (3,) float64, optional
         The lowest and the highest corner of the volume instead, metres.
     has_floor : bool
-        Whether nothing below z = 0 counts.
+        Whether nothing below z = 0 counts. A camera that stands there says that there is none.
     """
     if box_world is None:
         middle = _look_at(rig)
@@ -253,7 +253,7 @@ def working_volume(
             np.median(np.linalg.norm(rig.centers_world - middle, axis=1))
         )
         low, high = middle - reach_m, middle + reach_m
-        if has_floor and high[2] > 0:
+        if has_floor and high[2] > 0 and (rig.centers_world[:, 2] > 0).all():
             low[2] = max(low[2], 0.0)
     else:
         low, high = box_world

@@ -10,13 +10,14 @@ patterns*, IEEE Trans. PAMI 13(4), 1991.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board
+from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.placing.marks import Mark, click_warnings, rounded, triangulated
@@ -33,6 +34,13 @@ _SCALE_REFUSED = 0.2
 #: they lie in a plane, where a mirror image is a turn.
 _LINE = 1e-2
 _FLAT = 2e-2
+
+#: Cameras that are all nearer to the board than this are doubted.
+_SMALL_M = 0.05
+
+#: Boards in several planes mirror a camera to places that are further apart than this share of how
+#: far it is behind the first.
+_MIRRORED_APART = 0.1
 
 #: Points that fit worse than this share of their extent are looked at for exchanged names; an
 #: explanation must fit better by this factor.
@@ -129,12 +137,32 @@ def place_world(
         Naming what does not fit: points, or cameras that came out under the floor.
     """
     if kind == "points":
-        return place_by_points(cameras, [mark for mark in marks if mark.xyz_m is not None])
-    if kind == "floor":
-        return place_on_floor(cameras, seen, [mark for mark in marks if mark.is_floor])
-    if kind == "board":
-        return place_by_board(cameras, seen)
-    raise ValueError(f"unknown kind of world {kind!r}")
+        placed = place_by_points(cameras, [mark for mark in marks if mark.xyz_m is not None])
+    elif kind == "floor":
+        placed = place_on_floor(cameras, seen, [mark for mark in marks if mark.is_floor])
+    elif kind == "board":
+        placed = place_by_board(cameras, seen)
+    else:
+        raise ValueError(f"unknown kind of world {kind!r}")
+    told = placed.told
+    return replace(
+        placed, told=replace(told, warnings=(*told.warnings, *_told_small(cameras, seen)))
+    )
+
+
+def _told_small(cameras: Sequence[Camera], seen: SeenBoards) -> list[str]:
+    """Tell cameras that came out nearer to each other and to the board than cameras are built."""
+    pose, board, _ = seen.main()
+    middle = transform(seen.rig_from_board(pose, board), seen.boards[board].center_board[None])[0]
+    centers = np.array([camera.center_world for camera in cameras])
+    reach_m = float(np.linalg.norm(centers - middle, axis=1).max())
+    if reach_m >= _SMALL_M:
+        return []
+    square_mm = 1000.0 * seen.boards[board].square_m
+    return [
+        f"all cameras came out within {1000 * reach_m:.0f} mm of the board: is its square of "
+        f"{square_mm:g} mm told in millimetres? of as many centimetres, it has {10 * square_mm:g}"
+    ]
 
 
 def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
@@ -143,7 +171,8 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
     Raises
     ------
     CalibrationError
-        If a camera that sees it came out behind it.
+        If a camera that sees it came out behind it, and nothing tells that it sees its back through
+        a transparent sheet.
     """
     pose, board, seeing = seen.main()
     world_from_rig = invert(seen.rig_from_board(pose, board))
@@ -151,17 +180,21 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
     is_still = moment.is_clip and len(seen.instants) == 1
     heights = _heights(cameras, world_from_rig)
     below = [index for index in range(len(cameras)) if heights[index] <= 0]
-    wrong = [index for index in below if index in seeing]
+    wrong = [
+        index for index in below if index in seeing and not _sees_backs(index, cameras[index], seen)
+    ]
     if wrong:
         raise _under_floor(
             [cameras[index] for index in wrong],
             [heights[index] for index in wrong],
-            "is its picture mirrored, or did it see another board?",
+            "is its picture mirrored, or did it see another board? (if it sees the board's back "
+            "through a transparent sheet, move and tilt the board before it)",
         )
     warnings = [
         f"camera {cameras[index].name!r} stands {-heights[index]:.2f} m behind the plane of the "
         "board that is the world: wrong, if this board lies on the floor"
         for index in below
+        if index not in seeing
     ]
     text = (
         "the board as it lies in the clip"
@@ -179,6 +212,36 @@ def place_by_board(cameras: Sequence[Camera], seen: SeenBoards) -> Placed:
             warnings=tuple(warnings),
         ),
     )
+
+
+def _sees_backs(index: int, camera: Camera, seen: SeenBoards) -> bool:
+    """Tell whether a camera behind boards that it sees stands there, and is not merely mirrored.
+
+    A picture of a board that is mirrored is that of a camera behind it: of the true one, mirrored
+    at the board's plane. With boards in several planes, that other cameras see too, these are
+    several places. And a camera that sees boards of markers from the front records no mirrored
+    pictures (a mirrored chessboard is a chessboard).
+    """
+    center = camera.center_world
+    others = {view.pose for view in seen.views if view.camera != index}
+    mirrored = []
+    for view in seen.views:
+        is_shared = view.pose in others
+        if view.camera != index or not (is_shared or _has_markers(seen.boards[view.board])):
+            continue
+        rig_from_board = seen.rig_from_board(view.pose, view.board)
+        height_m = float((center - rig_from_board[:, 3]) @ rig_from_board[:, 2])
+        if height_m > 0:
+            return True
+        if is_shared:
+            mirrored.append(center - 2.0 * height_m * rig_from_board[:, 2])
+    apart_m = np.linalg.norm(np.array(mirrored) - mirrored[0], axis=1).max()
+    distance_m = np.linalg.norm(center - mirrored[0]) / 2.0
+    return bool(apart_m > _MIRRORED_APART * distance_m)
+
+
+def _has_markers(board: Board) -> bool:
+    return not isinstance(board, Chessboard)
 
 
 def place_by_points(cameras: Sequence[Camera], marks: Sequence[Mark]) -> Placed:

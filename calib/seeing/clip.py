@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,7 @@ from hybridve.calib.boards.board import (
     Sighting,
     is_seen,
 )
+from hybridve.calib.boards.suggest import what_is_seen
 from hybridve.calib.boards.target import Chessboard, refine_corners
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.image_io import FrameSource
@@ -45,6 +47,10 @@ _SPREAD_FRAMES = 9
 
 #: Frames whose means over 15x15 pixels differ by less show the same.
 _STILL_GREY = 8.0
+
+
+#: Averages in which another board is looked for where none is found.
+_AVERAGES = 4
 
 
 #: Bytes of grey frames of one clip held at once; larger images are averaged over fewer frames.
@@ -179,8 +185,14 @@ def observe_clips(
             if not found.with_board:
                 raise CalibrationError(
                     f"camera {clip.camera.name!r}: {listed_boards(search.boards)} found in "
-                    f"{clip.source.label} (average of {clip.n_frames} frames; {still.tried}); "
-                    "check columns and rows, or mark the corners by hand (`corners`)"
+                    f"{clip.source.label}"
+                    + (
+                        _seen_instead(
+                            search, clip, [clip, *(one for one in clips if one is not clip)]
+                        )
+                        or f" (average of {clip.n_frames} frames; {still.tried}); check columns "
+                        "and rows, or mark the corners by hand (`corners`)"
+                    )
                 )
             looked_at[clip.camera.name] = found
             stills[index] = _still_in_frames(search, clip, found) or still
@@ -202,6 +214,31 @@ def observe_clips(
         )
         for clip in clips
     ]
+
+
+def _seen_instead(search: Search, clip: _Clip, averages: Sequence[_Clip] = ()) -> str:
+    """Return what a clip shows in place of the boards, to follow what it does not; or nothing.
+
+    Of still boards the average is looked at first, and that of other clips, which may see better.
+    """
+
+    def look() -> Answer:
+        frames = clip.frames
+        chosen = sorted({0, len(frames) // 2, len(frames) - 1})
+        pictures: list[NDArray[Any]] = [one.picture for one in averages[:_AVERAGES]]
+        pictures += [frames[index] for index in chosen]
+        for board in search.boards:
+            seen = what_is_seen(board, pictures)
+            if seen is not None:
+                which = f"for board {board.name!r}, " if len(search.boards) > 1 else ""
+                return {"said": f": {which}{seen}"}, None
+        return {"said": ""}, None
+
+    keys = [part for one in (clip, *averages[:_AVERAGES]) for part in one.key]
+    asked = [
+        part for board in range(len(search.boards)) for part in search.question((), board, "quick")
+    ]
+    return str(search.cache.recall((*keys, *asked, "seen instead"), look)[0]["said"])
 
 
 def _observe_still_clip(search: Search, clip: _Clip, given: Given) -> Observations | _Unseen:
@@ -271,7 +308,10 @@ def _observe_still_clip(search: Search, clip: _Clip, given: Given) -> Observatio
         clip.camera.name,
         clip.camera.model,
         clip.size_px,
-        tuple(Sighting(CLIP, 0, number, pixels) for number, pixels in corners.items()),
+        tuple(
+            Sighting(CLIP, 0, number, pixels, found[number].beyond)
+            for number, pixels in corners.items()
+        ),
         True,
         picture=clip.picture,
         how="; ".join(f"{boards[number].name}: {how}" for number, how in hows.items())
@@ -290,10 +330,12 @@ def _still_in_frames(search: Search, clip: _Clip, found: Found) -> Observations 
     Somebody may stand before a board for so long that the average does not show it.
     """
     by_board: dict[int, list[NDArray[np.float64]]] = {}
+    beyond: dict[int, Counter[tuple[int, int]]] = {}
     notes: dict[str, None] = {}
     for (_, board), detection in sorted(found.detections.items(), key=lambda item: item[0]):
         if detection.corners is not None:
             by_board.setdefault(board, []).append(detection.corners)
+            beyond.setdefault(board, Counter())[detection.beyond] += 1
             notes |= dict.fromkeys(notes_of(search.boards, board, CLIP, detection))
     middles = {}
     strays_px = []
@@ -308,7 +350,10 @@ def _still_in_frames(search: Search, clip: _Clip, found: Found) -> Observations 
         clip.camera.name,
         clip.camera.model,
         clip.size_px,
-        tuple(Sighting(CLIP, 0, board, corners) for board, corners in middles.items()),
+        tuple(
+            Sighting(CLIP, 0, board, corners, max(beyond[board], key=beyond[board].__getitem__))
+            for board, corners in middles.items()
+        ),
         True,
         picture=clip.picture,
         how=f"detected in {len(found.with_board)} of {len(found.sizes)} frames, not in the average",
@@ -463,7 +508,8 @@ def _moving_clip(search: Search, clip: _Clip, found: Found) -> Observations:
     if not found.with_board:
         raise CalibrationError(
             f"camera {clip.camera.name!r}: {listed_boards(search.boards)} found in any of "
-            f"{len(found.sizes)} frames of {clip.source.label}; check columns and rows"
+            f"{len(found.sizes)} frames of {clip.source.label}"
+            + (_seen_instead(search, clip) or "; check columns and rows")
         )
     names = {index: f"{CLIP}, frame {index}" for index in sorted(found.sizes)}
     sightings, notes = sightings_of(search.boards, found, names, True)

@@ -8,6 +8,7 @@ that a second run decodes no picture.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -63,7 +64,8 @@ def observe_boards(
     CalibrationError
         Naming the camera, and what was tried, where its clip shows no board at all; if two boards
         look alike, a camera is listed twice or has no clip, or its stills are of another aspect
-        than its clip; for corners of a file that belong to no picture.
+        than its clip; for corners of a file that belong to no picture; for a chessboard that is
+        larger than described.
     """
     _check_boards(boards)
     _check_inputs(cameras)
@@ -71,10 +73,12 @@ def observe_boards(
         given = {camera.name: given_corners(boards, camera) for camera in cameras}
         clips = observe_clips(search, cameras, given)
         stills = [observe_stills(search, camera, given[camera.name]) for camera in cameras]
-    return [
+    seen = [
         _put_together(camera, still, clip)
         for camera, still, clip in zip(cameras, stills, clips, strict=True)
     ]
+    _refuse_larger(boards, seen)
+    return seen
 
 
 def find_boards(
@@ -108,7 +112,9 @@ def find_boards(
     with Search(boards, settings, progress or _no_progress, cache) as search:
         given = {camera.name: given_corners(boards, camera) for camera in seeing}
         clips = observe_clips(search, seeing, given)
-    return [_put_together(camera, None, clip) for camera, clip in zip(seeing, clips, strict=True)]
+    seen = [_put_together(camera, None, clip) for camera, clip in zip(seeing, clips, strict=True)]
+    _refuse_larger(boards, seen)
+    return seen
 
 
 def _no_progress(what: str, done: int, total: int) -> None:
@@ -128,6 +134,40 @@ def _check_boards(boards: Sequence[Board]) -> None:
                 f"({first}), so that no picture tells one from the other; use boards of different "
                 "numbers of corners, or with different markers"
             )
+
+
+def _refuse_larger(boards: Sequence[Board], seen: Sequence[Observations]) -> None:
+    """Refuse a chessboard whose corners go on beyond its edge in most pictures.
+
+    Raises
+    ------
+    CalibrationError
+        Naming the number that is wrong and the number of corners that it has.
+    """
+    for number, board in enumerate(boards):
+        if not isinstance(board, Chessboard):
+            continue
+        beyond = [one.beyond for each in seen for one in each.sightings if one.board == number]
+        larger = Counter(lines for lines in beyond if any(lines))
+        if 2 * larger.total() <= len(beyond):
+            continue
+        # Part of a larger board may be out of some pictures: of equal votes the larger one.
+        more_columns, more_rows = max(larger, key=lambda lines: (larger[lines], sum(lines)))
+        said = [
+            f"{name} = {count}"
+            for name, count, more in (
+                ("columns", board.columns, more_columns),
+                ("rows", board.rows, more_rows),
+            )
+            if more
+        ]
+        which = f"board {board.name!r}: " if len(boards) > 1 else ""
+        raise CalibrationError(
+            f"{which}{' and '.join(said)}, but corners go on beyond the edge in {larger.total()} "
+            f"of {len(beyond)} pictures: the board has {board.columns + more_columns} x "
+            f"{board.rows + more_rows} inner corners; say columns = {board.columns + more_columns} "
+            f"and rows = {board.rows + more_rows}"
+        )
 
 
 def _check_inputs(cameras: Sequence[CameraInput]) -> None:

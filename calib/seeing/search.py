@@ -75,12 +75,18 @@ class Search:
 
 
 def _told(detection: Detection) -> Answer:
-    return {"how": detection.how, "notes": list(detection.notes)}, detection.corners
+    told = {
+        "how": detection.how,
+        "notes": list(detection.notes),
+        "beyond": list(detection.beyond),
+    }
+    return told, detection.corners
 
 
 def _detection(answer: Answer) -> Detection:
     told, corners = answer
-    return Detection(corners, told["how"], tuple(told["notes"]))
+    columns, rows = told["beyond"]
+    return Detection(corners, told["how"], tuple(told["notes"]), (columns, rows))
 
 
 def describe_board(board: Board) -> str:

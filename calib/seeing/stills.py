@@ -99,7 +99,9 @@ def sightings_of(
         for number, detection in without_parts(boards, in_image).items():
             if detection.corners is not None:
                 instant = index if is_clip else None
-                sightings.append(Sighting(image, instant, number, detection.corners))
+                sightings.append(
+                    Sighting(image, instant, number, detection.corners, detection.beyond)
+                )
                 notes += notes_of(boards, number, image, detection)
     return tuple(sightings), tuple(notes)
 
