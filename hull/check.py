@@ -11,12 +11,13 @@ A *problem* makes a run impossible. A *note* is worth a look: a run would go thr
 may not be what was wanted.
 """
 
+import logging
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -236,6 +237,8 @@ def check_session(
 ) -> tuple[SessionCheck, Look]:
     """Return what there is to say of a session, and of a layout in it, and what was looked at.
 
+    What a run would log as a warning is a note here, and is not logged.
+
     Parameters
     ----------
     path : Path
@@ -247,8 +250,15 @@ def check_session(
     watcher : Watcher
         Told how the look goes on.
     """
-    problems: list[str] = []
     notes: list[str] = []
+    with _warnings_noted(notes):
+        return _check(path, scene, settings, watcher, notes)
+
+
+def _check(
+    path: Path, scene: Path | None, settings: EvaluateSettings, watcher: Watcher, notes: list[str]
+) -> tuple[SessionCheck, Look]:
+    problems: list[str] = []
     asked = _Asked(problems)
     look = Look(asked.of(lambda: load_session(path)))
     if look.session is None:
@@ -303,6 +313,38 @@ def check_session(
         notes=tuple(dict.fromkeys(notes)),
     )
     return found, look
+
+
+class _Notes(logging.Handler):
+    """Keeps what is logged as a warning."""
+
+    def __init__(self, notes: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._notes = notes
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a message."""
+        self._notes.append(record.getMessage())
+
+
+@contextmanager
+def _warnings_noted(notes: list[str]) -> Iterator[None]:
+    """Have warnings of this package noted, and not logged, while the block runs."""
+
+    def is_shown(record: logging.LogRecord) -> bool:
+        return record.levelno < logging.WARNING or not record.name.startswith("hybridve.")
+
+    logger, handlers = logging.getLogger("hybridve"), logging.getLogger().handlers[:]
+    noting = _Notes(notes)
+    logger.addHandler(noting)
+    for handler in handlers:
+        handler.addFilter(is_shown)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.removeFilter(is_shown)
+        logger.removeHandler(noting)
 
 
 class _Asked:

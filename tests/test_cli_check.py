@@ -130,6 +130,20 @@ def test_what_is_odd_is_noted_and_a_run_would_go_through(
     assert check(session, "--strict")[0] == 1
 
 
+def test_what_a_run_would_warn_of_is_a_note_and_told_once(
+    session: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = session / "session.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("fps = 25\n", ""), encoding="utf-8")
+
+    assert run("check", session, "--json") == 0
+
+    told = capsys.readouterr()
+    notes = [note for note in json.loads(told.out)["notes"] if "fps: this key is missing" in note]
+    assert len(notes) == 1
+    assert told.err == ""
+
+
 def test_every_missing_file_is_told_at_once(session: Path, check: Check) -> None:
     for camera in ("cam1", "cam3"):
         shutil.rmtree(session / camera)
