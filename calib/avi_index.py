@@ -85,7 +85,10 @@ def _index(file: BinaryIO, size: int) -> tuple[int, list[tuple[bytes, int, int]]
                 for entry in struct.iter_unpack("<4sIII", table[: len(table) // 16 * 16])
             ]
             first = next((one[0] for one in entries if one[0][2:] in (b"dc", b"db")), b"")
-            return movi, [one for one in entries if one[0] == first]
+            stream = [one for one in entries if one[0][:2] == first[:2]]
+            if any(name != first or length <= 1 for name, _, length in stream):
+                return movi, []  # frames that stand for the one before: readers leave them out
+            return movi, stream
         at += 8 + length + length % 2
     return movi, []
 

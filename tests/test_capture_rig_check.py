@@ -70,7 +70,13 @@ def pictures() -> dict[str, np.ndarray]:
 def session(tmp_path: Path, pictures: dict[str, np.ndarray]) -> Path:
     """A session with a board clip, masks, and a rig made elsewhere that is right."""
     lines = [
-        *('format = "hybridve-session"', "version = 1", 'rig = "rig.csv"', 'rig_unit = "m"'),
+        *(
+            'format = "hybridve-session"',
+            "version = 1",
+            "fps = 25",
+            'rig = "rig.csv"',
+            'rig_unit = "m"',
+        ),
         *("[target]", 'kind = "chessboard"', "columns = 7", "rows = 6", "square_mm = 100"),
     ]
     mask = np.zeros(SIZE_PX[::-1], np.uint8)
