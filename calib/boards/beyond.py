@@ -47,23 +47,35 @@ def lines_beyond(grey: NDArray[np.float32], grid_px: NDArray[np.float64]) -> tup
     columns, rows : int
         Of both sides together; 0, 0 where the board ends as it was described.
     """
+    # Most boards end where they should: the picture next to them tells, and is quickly smoothed.
+    if _looked_for(grey, grid_px, 1) == (0, 0):
+        return 0, 0
+    return _looked_for(grey, grid_px, _MOST_LINES)
+
+
+def _looked_for(
+    grey: NDArray[np.float32], grid_px: NDArray[np.float64], most_lines: int
+) -> tuple[int, int]:
+    """Return how many columns and rows go on, up to so many on each side."""
     steps_px = [np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1) for axis in (0, 1)]
     blur_px = _BLUR * min(float(np.median(steps)) for steps in steps_px)
     height, width = grey.shape
-    # Only what lies around the board is blurred.
-    reach_px = 2.0 * _MOST_LINES * max(float(steps.max()) for steps in steps_px)
+    # Only what lies around the board is smoothed.
+    reach_px = 2.0 * (most_lines + _SAMPLED_AT) * max(float(steps.max()) for steps in steps_px)
     low = np.maximum(np.floor(grid_px.min(axis=(0, 1)) - reach_px), 0).astype(int)
     high = np.minimum(np.ceil(grid_px.max(axis=(0, 1)) + reach_px), (width, height)).astype(int)
     around = grey[low[1] : high[1], low[0] : high[0]]
     smooth = np.asarray(cv2.GaussianBlur(around, (0, 0), max(blur_px, 0.3)), np.float32)
     grid = grid_px - low
     upright = grid.transpose(1, 0, 2)
-    rows = _lines_after(smooth, grid) + _lines_after(smooth, grid[::-1])
-    columns = _lines_after(smooth, upright) + _lines_after(smooth, upright[::-1])
+    rows = _lines_after(smooth, grid, most_lines) + _lines_after(smooth, grid[::-1], most_lines)
+    columns = _lines_after(smooth, upright, most_lines) + _lines_after(
+        smooth, upright[::-1], most_lines
+    )
     return columns, rows
 
 
-def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64]) -> int:
+def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64], most_lines: int) -> int:
     """Return how many lines (rows of the grid) come after the last."""
     lines = list(grid_px)
     inner, outer, _ = _across(smooth, np.array(lines[-_LINES_BEFORE:]), 0)
@@ -74,7 +86,7 @@ def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64]) -> i
         return 0
     step = float(np.median((signs * (inner - outer))[known])) / 2
     signs *= np.sign(step)
-    for count in range(_MOST_LINES):
+    for count in range(most_lines):
         before = np.array(lines[-_LINES_BEFORE:])
         inner, outer, places = _across(smooth, before, 1)
         signs = -signs
@@ -87,7 +99,7 @@ def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64]) -> i
         if is_crossing[inside].mean() < _CROSSINGS or not np.isfinite(places).all():
             return count
         lines.append(_drawn(smooth, places, lines[-1]))
-    return _MOST_LINES
+    return most_lines
 
 
 def _drawn(
