@@ -78,7 +78,11 @@ def _looked_for(
 def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64], most_lines: int) -> int:
     """Return how many lines (rows of the grid) come after the last."""
     lines = list(grid_px)
-    inner, outer, _ = _across(smooth, np.array(lines[-_LINES_BEFORE:]), 0)
+    length = len(lines[0])
+    img_from_lines = _img_from_lines(lines)
+    if img_from_lines is None:
+        return 0
+    inner, outer, _ = _across(smooth, img_from_lines, length, 0)
     # At a crossing, neighbours differ one way on this side of the line, the other way beyond it.
     signs = np.where(np.arange(len(inner)) % 2 == 0, 1.0, -1.0)
     known = np.isfinite(inner - outer)
@@ -87,8 +91,11 @@ def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64], most
     step = float(np.median((signs * (inner - outer))[known])) / 2
     signs *= np.sign(step)
     for count in range(most_lines):
-        before = np.array(lines[-_LINES_BEFORE:])
-        inner, outer, places = _across(smooth, before, 1)
+        if count > 0:
+            img_from_lines = _img_from_lines(lines)
+        if img_from_lines is None:
+            return count
+        inner, outer, places = _across(smooth, img_from_lines, length, 1)
         signs = -signs
         inside = np.isfinite(inner) & np.isfinite(outer)
         is_crossing = (signs * inner > _CONTRAST * abs(step)) & (
@@ -126,25 +133,28 @@ def _drawn(
     return np.where(is_near[:, None], drawn, places)
 
 
+def _img_from_lines(lines_px: list[NDArray[np.float64]]) -> NDArray[np.float64] | None:
+    """Return the homography of the last lines, which has the last of them at y = 0."""
+    before = np.array(lines_px[-_LINES_BEFORE:])
+    x, y = np.meshgrid(np.arange(before.shape[1]), np.arange(1 - len(before), 1))
+    plane = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
+    found, _ = cv2.findHomography(plane, before.reshape(-1, 2))
+    matrix = np.asarray(found, np.float64)
+    return matrix if matrix.shape == (3, 3) else None  # OpenCV's None has no shape
+
+
 def _across(
-    smooth: NDArray[np.float32], lines_px: NDArray[np.float64], after: int
+    smooth: NDArray[np.float32], img_from_lines: NDArray[np.float64], length: int, after: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Compare the four squares around each corner of a line so many after the last of some.
+    """Compare the four squares around each corner of a line so many after the last.
 
     Returned are how much brighter the next square is than the one before along the line, on this
     side of it and beyond, (N,), NaN outside the picture; and where the corners are, (N, 2).
     """
-    count, length, _ = lines_px.shape
-    x, y = np.meshgrid(np.arange(length, dtype=float), np.arange(count, dtype=float))
-    plane = np.stack([x, y], axis=-1).reshape(-1, 2)
-    matrix, _ = cv2.findHomography(plane, lines_px.reshape(-1, 2))
-    nothing = np.full(length, np.nan)
-    if matrix is None:
-        return nothing, nothing, np.full((length, 2), np.nan)
-    middles = np.column_stack([np.arange(length, dtype=float), np.full(length, count - 1 + after)])
+    middles = np.column_stack([np.arange(length, dtype=float), np.full(length, float(after))])
     offsets = _SAMPLED_AT * np.array([[0, 0], [-1, -1], [1, -1], [-1, 1], [1, 1]])
     wanted = (middles + offsets[:, None]).reshape(-1, 2)
-    mapped = wanted @ matrix[:, :2].T + matrix[:, 2]
+    mapped = wanted @ img_from_lines[:, :2].T + img_from_lines[:, 2]
     mapped[mapped[:, 2] <= 0] = np.nan
     places = (mapped[:, :2] / mapped[:, 2:]).reshape(5, length, 2)
     height, width = smooth.shape
