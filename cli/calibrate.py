@@ -332,8 +332,9 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
     record = _record_of(rig)
     if certificate is not None:
         click.echo(certificate.verdict)
-        click.echo(f"  {_volume_text(certificate)}")
     click.echo(f"{path}: {len(rig.cameras)} cameras")
+    if certificate is not None:
+        click.echo(f"  {_volume_text(certificate)}")
     certified = {} if certificate is None else {one.name: one for one in certificate.cameras}
     for camera in rig.cameras:
         x, y, z = camera.center_world

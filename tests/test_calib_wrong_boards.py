@@ -179,6 +179,7 @@ SAID_OF_CHARUCO: list[tuple[Board, str]] = [
     (replace(CHARUCO, columns=6, rows=8), "say columns = 8, rows = 6"),
     (replace(CHARUCO, columns=7, rows=5), "say columns = 8, rows = 6"),
     (replace(CHARUCO, first_id=30), "say first_id = 0"),
+    (replace(CHARUCO, first_id=10), "say first_id = 0"),  # every other row lies as described
 ]
 
 

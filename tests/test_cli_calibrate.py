@@ -269,6 +269,8 @@ def test_the_text_begins_with_the_verdict(
     (opinion,) = [line for line in lines if "second opinion" in line]
     assert f"{told['sigmas']:.1f} standard deviations" in opinion
     assert lines[1] == f"{tmp_path / 'rig' / 'rig.json'}: 3 cameras"
+    low, high = (calibrated[1]["certificate"][f"volume_{end}_m"] for end in ("low", "high"))
+    assert f"x {low[0]:.2f} to {high[0]:.2f}, y {low[1]:.2f} to {high[1]:.2f}" in lines[2]
 
 
 @pytest.mark.slow

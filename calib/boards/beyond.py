@@ -47,26 +47,42 @@ def lines_beyond(grey: NDArray[np.float32], grid_px: NDArray[np.float64]) -> tup
     columns, rows : int
         Of both sides together; 0, 0 where the board ends as it was described.
     """
+    # Most boards end where they should: the picture next to them tells, and is quickly smoothed.
+    if _looked_for(grey, grid_px, 1) == (0, 0):
+        return 0, 0
+    return _looked_for(grey, grid_px, _MOST_LINES)
+
+
+def _looked_for(
+    grey: NDArray[np.float32], grid_px: NDArray[np.float64], most_lines: int
+) -> tuple[int, int]:
+    """Return how many columns and rows go on, up to so many on each side."""
     steps_px = [np.linalg.norm(np.diff(grid_px, axis=axis), axis=-1) for axis in (0, 1)]
     blur_px = _BLUR * min(float(np.median(steps)) for steps in steps_px)
     height, width = grey.shape
-    # Only what lies around the board is blurred.
-    reach_px = 2.0 * _MOST_LINES * max(float(steps.max()) for steps in steps_px)
+    # Only what lies around the board is smoothed.
+    reach_px = 2.0 * (most_lines + _SAMPLED_AT) * max(float(steps.max()) for steps in steps_px)
     low = np.maximum(np.floor(grid_px.min(axis=(0, 1)) - reach_px), 0).astype(int)
     high = np.minimum(np.ceil(grid_px.max(axis=(0, 1)) + reach_px), (width, height)).astype(int)
     around = grey[low[1] : high[1], low[0] : high[0]]
     smooth = np.asarray(cv2.GaussianBlur(around, (0, 0), max(blur_px, 0.3)), np.float32)
     grid = grid_px - low
     upright = grid.transpose(1, 0, 2)
-    rows = _lines_after(smooth, grid) + _lines_after(smooth, grid[::-1])
-    columns = _lines_after(smooth, upright) + _lines_after(smooth, upright[::-1])
+    rows = _lines_after(smooth, grid, most_lines) + _lines_after(smooth, grid[::-1], most_lines)
+    columns = _lines_after(smooth, upright, most_lines) + _lines_after(
+        smooth, upright[::-1], most_lines
+    )
     return columns, rows
 
 
-def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64]) -> int:
+def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64], most_lines: int) -> int:
     """Return how many lines (rows of the grid) come after the last."""
     lines = list(grid_px)
-    inner, outer, _ = _across(smooth, np.array(lines[-_LINES_BEFORE:]), 0)
+    length = len(lines[0])
+    img_from_lines = _img_from_lines(lines)
+    if img_from_lines is None:
+        return 0
+    inner, outer, _ = _across(smooth, img_from_lines, length, 0)
     # At a crossing, neighbours differ one way on this side of the line, the other way beyond it.
     signs = np.where(np.arange(len(inner)) % 2 == 0, 1.0, -1.0)
     known = np.isfinite(inner - outer)
@@ -74,9 +90,12 @@ def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64]) -> i
         return 0
     step = float(np.median((signs * (inner - outer))[known])) / 2
     signs *= np.sign(step)
-    for count in range(_MOST_LINES):
-        before = np.array(lines[-_LINES_BEFORE:])
-        inner, outer, places = _across(smooth, before, 1)
+    for count in range(most_lines):
+        if count > 0:
+            img_from_lines = _img_from_lines(lines)
+        if img_from_lines is None:
+            return count
+        inner, outer, places = _across(smooth, img_from_lines, length, 1)
         signs = -signs
         inside = np.isfinite(inner) & np.isfinite(outer)
         is_crossing = (signs * inner > _CONTRAST * abs(step)) & (
@@ -87,7 +106,7 @@ def _lines_after(smooth: NDArray[np.float32], grid_px: NDArray[np.float64]) -> i
         if is_crossing[inside].mean() < _CROSSINGS or not np.isfinite(places).all():
             return count
         lines.append(_drawn(smooth, places, lines[-1]))
-    return _MOST_LINES
+    return most_lines
 
 
 def _drawn(
@@ -114,25 +133,28 @@ def _drawn(
     return np.where(is_near[:, None], drawn, places)
 
 
+def _img_from_lines(lines_px: list[NDArray[np.float64]]) -> NDArray[np.float64] | None:
+    """Return the homography of the last lines, which has the last of them at y = 0."""
+    before = np.array(lines_px[-_LINES_BEFORE:])
+    x, y = np.meshgrid(np.arange(before.shape[1]), np.arange(1 - len(before), 1))
+    plane = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
+    found, _ = cv2.findHomography(plane, before.reshape(-1, 2))
+    matrix = np.asarray(found, np.float64)
+    return matrix if matrix.shape == (3, 3) else None  # OpenCV's None has no shape
+
+
 def _across(
-    smooth: NDArray[np.float32], lines_px: NDArray[np.float64], after: int
+    smooth: NDArray[np.float32], img_from_lines: NDArray[np.float64], length: int, after: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Compare the four squares around each corner of a line so many after the last of some.
+    """Compare the four squares around each corner of a line so many after the last.
 
     Returned are how much brighter the next square is than the one before along the line, on this
     side of it and beyond, (N,), NaN outside the picture; and where the corners are, (N, 2).
     """
-    count, length, _ = lines_px.shape
-    x, y = np.meshgrid(np.arange(length, dtype=float), np.arange(count, dtype=float))
-    plane = np.stack([x, y], axis=-1).reshape(-1, 2)
-    matrix, _ = cv2.findHomography(plane, lines_px.reshape(-1, 2))
-    nothing = np.full(length, np.nan)
-    if matrix is None:
-        return nothing, nothing, np.full((length, 2), np.nan)
-    middles = np.column_stack([np.arange(length, dtype=float), np.full(length, count - 1 + after)])
+    middles = np.column_stack([np.arange(length, dtype=float), np.full(length, float(after))])
     offsets = _SAMPLED_AT * np.array([[0, 0], [-1, -1], [1, -1], [-1, 1], [1, 1]])
     wanted = (middles + offsets[:, None]).reshape(-1, 2)
-    mapped = wanted @ matrix[:, :2].T + matrix[:, 2]
+    mapped = wanted @ img_from_lines[:, :2].T + img_from_lines[:, 2]
     mapped[mapped[:, 2] <= 0] = np.nan
     places = (mapped[:, :2] / mapped[:, 2:]).reshape(5, length, 2)
     height, width = smooth.shape

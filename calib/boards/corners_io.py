@@ -63,7 +63,10 @@ def read_given(path: Path, boards: Sequence[Board]) -> list[GivenCorners]:
         corners = read_corners(path)
         fitting = [i for i, board in enumerate(boards) if len(board.points_board) == len(corners)]
         if len(fitting) != 1:
-            raise CalibrationError(f"{path}: {len(corners)} corners, expected {_counts(boards)}")
+            raise CalibrationError(
+                f"{path}: {len(corners)} corners, expected {_counts(boards)}"
+                f"{_likely(boards, len(corners))}"
+            )
         return [GivenCorners(None, fitting[0], _in_order(boards[fitting[0]], corners, str(path)))]
 
     groups: dict[tuple[str | int | None, int], list[tuple[int | None, float, float]]] = {}
@@ -144,6 +147,23 @@ def _whole(text: str, column: str, place: str) -> int:
 
 def _counts(boards: Sequence[Board]) -> str:
     return " or ".join(f"{len(board.points_board)} ({board})" for board in boards)
+
+
+def _likely(boards: Sequence[Board], count: int) -> str:
+    """Return which board of about the described size has so many corners; nothing if unclear."""
+    if len(boards) != 1 or not isinstance(boards[0], Chessboard):
+        return ""
+    board = boards[0]
+    fitting = [
+        (columns, rows)
+        for columns in range(board.columns - 1, board.columns + 2)
+        for rows in range(board.rows - 1, board.rows + 2)
+        if columns * rows == count
+    ]
+    if len(fitting) != 1:
+        return ""
+    columns, rows = fitting[0]
+    return f"; a board of {columns} x {rows} inner corners has {count}: check columns and rows"
 
 
 def _assemble(

@@ -57,6 +57,11 @@ _LINK_TOLERANCE = 0.15
 _LINK_TOLERANCE_PX = 1.5
 
 
+#: A group of markers that others contradict is the board if it has this share of those read: every
+#: other row of a board whose markers are counted from a wrong number lies as described.
+_LEAST_SHARE = 0.6
+
+
 @lru_cache(maxsize=8)
 def dictionary_of(name: str) -> Any:
     """Return one of the families of markers that OpenCV knows."""
@@ -182,8 +187,8 @@ def _link(
     """Return the largest group of markers that lie to each other as on the board.
 
     Compared are markers that are neighbours on the board, where no lens bends it. Returns the
-    indices into `members`, and how many pairs agree; none if more markers contradict the group
-    than belong to it, as on another board of the same dictionary.
+    indices into `members`, and how many pairs agree; none if too many markers contradict the group,
+    as on another board of the same dictionary, or on one that is counted from another number.
     """
     nobody = np.zeros(0, np.intp), 0
     if len(members) < 2:
@@ -214,7 +219,9 @@ def _link(
     against = np.zeros(len(members), bool)
     against[second[~agree & inside[first]]] = True
     against[first[~agree & inside[second]]] = True
-    if (against & ~inside).sum() > inside.sum():
+    contrary = int((against & ~inside).sum())
+    is_most = inside.sum() >= _LEAST_SHARE * len(np.unique(members))
+    if contrary > inside.sum() or (contrary and not is_most):
         return nobody
     # A number that was read twice is taken where more neighbours agree.
     votes = np.bincount(np.concatenate([first[agree], second[agree]]), minlength=len(members))

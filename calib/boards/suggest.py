@@ -366,6 +366,9 @@ def _measured(
     margin = _margin(seen, grey, img_from_board)
     if margin is None:
         return seen
+    if isinstance(board, AprilGrid):  # its markers were measured, its squares were not
+        square_m = _round_length(board.tag_m / (1.0 - 2.0 * margin))
+        return replace(seen, square_m=square_m, marker_m=board.tag_m)
     marker_m = (1.0 - 2.0 * margin) * seen.square_m
     if isinstance(board, Charuco) and _is_same(marker_m, board.marker_m):
         return replace(seen, marker_m=board.marker_m)

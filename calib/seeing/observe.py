@@ -147,7 +147,15 @@ def _refuse_larger(boards: Sequence[Board], seen: Sequence[Observations]) -> Non
     for number, board in enumerate(boards):
         if not isinstance(board, Chessboard):
             continue
-        beyond = [one.beyond for each in seen for one in each.sightings if one.board == number]
+        beyond = []
+        for each in seen:
+            # What lies beside one board may be another, which has no margin.
+            shown = Counter(one.image for one in each.sightings)
+            beyond += [
+                one.beyond
+                for one in each.sightings
+                if one.board == number and shown[one.image] == 1
+            ]
         larger = Counter(lines for lines in beyond if any(lines))
         if 2 * larger.total() <= len(beyond):
             continue
