@@ -814,9 +814,30 @@ def test_stills_of_another_size_are_left_out_and_named(recorded: Path, tmp_path:
 
     assert seen.missed["0.png"] == "is 540x405 pixels, most are 360x270"
     assert "0.png" not in {sighting.image for sighting in seen.sightings}
-    alone = replace(left, intrinsics=open_source(tmp_path, "0.png"))
-    with pytest.raises(CalibrationError, match=r"'left': intrinsics are 540x405 .* 360x270"):
-        observe_boards([BOARD], [alone], SETTINGS)
+
+
+def test_stills_at_another_size_are_taken_as_the_clip_would_show_them(
+    recorded: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    image = cv2.imread(str(recorded / "left" / "stills" / "0.png"))
+    assert image is not None
+    for name, size in (("as_it_is", (360, 270)), ("larger", (720, 540)), ("wide", (720, 405))):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.png"), cv2.resize(image, size))
+    left = inputs(recorded)[0]
+    seen = {}
+    for name in ("as_it_is", "larger"):
+        stills = open_source(tmp_path, f"{name}/0.png")
+        (found,) = observe_boards([BOARD], [replace(left, intrinsics=stills)], SETTINGS)
+        assert found.size_px == (360, 270)
+        (seen[name],) = (one.pixels for one in found.sightings if one.instant is None)
+
+    assert "720x540 pixels are taken for the same picture as the clip's 360x270" in caplog.text
+    # Corners of a picture that was blown up are found anew, some hundredths of a pixel beside.
+    assert np.nanmax(np.abs(seen["larger"] - seen["as_it_is"])) < 0.1
+    wide = replace(left, intrinsics=open_source(tmp_path, "wide/0.png"))
+    with pytest.raises(CalibrationError, match=r"'left': intrinsics are 720x405 .* 360x270"):
+        observe_boards([BOARD], [wide], SETTINGS)
 
 
 def test_pictures_of_one_name_are_called_by_their_folders(recorded: Path, tmp_path: Path) -> None:
