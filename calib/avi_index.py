@@ -39,6 +39,16 @@ class AviFrames:
     damaged: frozenset[int]
 
 
+def is_avi(path: Path) -> bool:
+    """Tell whether a file is an AVI, whose frames have no time stamps of their own."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:
+        return False
+    return head[:4] == b"RIFF" and head[8:] == b"AVI "
+
+
 def avi_frames(path: Path) -> AviFrames | None:
     """Return what the index of an AVI file says of its frames; None if it has none, or is no AVI.
 

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.avi_index import AviFrames, avi_frames
+from hybridve.calib.avi_index import AviFrames, avi_frames, is_avi
 from hybridve.calib.errors import SessionError
 
 _log = logging.getLogger(__name__)
@@ -171,7 +171,8 @@ class FrameSource:
         avi = avi_frames(self.paths[0])
         places = _Places(avi)
         video = _open_video(self.paths[0], self.label)
-        rate = video.get(cv2.CAP_PROP_FPS)
+        # An AVI counts frames; where it holds one for two, as of some codecs, readers jump a stamp.
+        rate = 0.0 if is_avi(self.paths[0]) else video.get(cv2.CAP_PROP_FPS)
         index = 0  # the next frame to be yielded
         try:
             while stop is None or index < stop:

@@ -65,7 +65,7 @@ def write_pictures(
 @pytest.fixture
 def session(tmp_path: Path) -> Path:
     """A session of two cameras, of which the second was bumped into after its calibration."""
-    lines = ['format = "hybridve-session"', "version = 1", 'rig = "rig.json"']
+    lines = ['format = "hybridve-session"', "version = 1", "fps = 25", 'rig = "rig.json"']
     mask = np.zeros((LENS.height_px, LENS.width_px), np.uint8)
     mask[100:140, 140:180] = 255
     for name, turn in zip(NAMES, (NONE, BUMP), strict=True):

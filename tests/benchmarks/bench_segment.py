@@ -67,10 +67,7 @@ def frames(recordings: Path) -> list[Image]:
 @pytest.fixture(scope="module")
 def painted(recordings: Path) -> list[NDArray[np.bool_]]:
     folder = recordings / "horseman" / "manual_masks"
-    return [
-        read_image(folder / f"manual_mask_{camera}.jpg", cv2.IMREAD_GRAYSCALE) > 127
-        for camera in CAMERAS
-    ]
+    return [read_image(folder / f"manual_mask_{camera}.jpg")[..., 0] > 127 for camera in CAMERAS]
 
 
 def ours(empty: list[Image]) -> Cut:
