@@ -256,7 +256,7 @@ def test_a_ball_of_a_lamp_is_as_bright_as_a_point_and_its_shadow_is_soft() -> No
     more_m=st.floats(0.0, 0.2),
     lamp_mm=st.tuples(*[st.floats(-800.0, 800.0)] * 2, st.floats(-100.0, 1500.0)),
 )
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_a_larger_hull_never_lights_more(
     center: tuple[float, ...],
     radius_m: float,

@@ -517,7 +517,7 @@ def test_columns_are_as_told() -> None:
     restitution=st.floats(0.0, 1.0),
     step_s=st.floats(1e-4, 0.1),
 )
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_whatever_the_hull_does_none_is_in_it_and_all_are_numbers(
     center: tuple[float, ...],
     moved: tuple[float, ...],

@@ -13,7 +13,7 @@ VIEWS = views_around()
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     recovery=st.sampled_from(["direction", "nearest"]),
