@@ -1,6 +1,7 @@
 """HDF5 files with one result each: complete or absent, of a known format and version."""
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -110,6 +111,27 @@ def writing(path: Path) -> Iterator[h5py.File]:
             yield file
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error}") from error
+
+
+def begin_parts(path: Path, parts: Path, stamp: str) -> None:
+    """Make the empty folder in which the parts of a result are gathered, with what it is of.
+
+    What stands there is removed.
+
+    Raises
+    ------
+    ReportError
+        If it cannot be written; it names the result at `path`.
+    """
+    try:
+        if parts.is_dir():
+            shutil.rmtree(parts)
+        parts.mkdir(parents=True)
+        (parts / "settings.json").write_text(stamp, encoding="utf-8")
+    except OSError as error:
+        raise ReportError(
+            f"{path}: cannot be written: {error.strerror} ({error.filename})"
+        ) from error
 
 
 def format_of(path: Path) -> str:

@@ -34,6 +34,7 @@ from hybridve.hull.report.machine import utc_now
 from hybridve.hull.report.result_file import (
     STORED,
     Described,
+    begin_parts,
     read_run,
     reading,
     store,
@@ -136,18 +137,7 @@ class SimulationWriter:
         if self._parts.is_dir() and not overwrite:
             self._take_up(json.loads(json.dumps(stamp)), resume=resume)
         else:
-            self._start(stamp)
-
-    def _start(self, stamp: Mapping[str, Any]) -> None:
-        try:
-            if self._parts.is_dir():
-                shutil.rmtree(self._parts)
-            self._parts.mkdir(parents=True)
-            (self._parts / "settings.json").write_text(json.dumps(stamp), encoding="utf-8")
-        except OSError as error:
-            raise ReportError(
-                f"{self._path}: cannot be written: {error.strerror} ({error.filename})"
-            ) from error
+            begin_parts(path, self._parts, json.dumps(stamp))
 
     def _take_up(self, stamp: Mapping[str, Any], *, resume: bool) -> None:
         if not resume:

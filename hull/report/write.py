@@ -44,7 +44,14 @@ from hybridve.hull.report.columns import (
     tables_of,
 )
 from hybridve.hull.report.machine import utc_now
-from hybridve.hull.report.result_file import STORED, store, store_text, write_run, writing
+from hybridve.hull.report.result_file import (
+    STORED,
+    begin_parts,
+    store,
+    store_text,
+    write_run,
+    writing,
+)
 from hybridve.hull.report.schema import VERSION, Column, FrameResult, ReportHeader
 from hybridve.hull.report.vtk import MOST_SHOWN, add_vtkhdf
 from hybridve.hull.report.vtk_blocks import FramePoints
@@ -104,18 +111,7 @@ class ReportWriter:
         if self._parts.is_dir() and not overwrite:
             self._take_up(stamp, resume=resume)
         else:
-            self._start(stamp)
-
-    def _start(self, stamp: str) -> None:
-        try:
-            if self._parts.is_dir():
-                shutil.rmtree(self._parts)
-            self._parts.mkdir(parents=True)
-            (self._parts / "settings.json").write_text(stamp, encoding="utf-8")
-        except OSError as error:
-            raise ReportError(
-                f"{self._path}: cannot be written: {error.strerror} ({error.filename})"
-            ) from error
+            begin_parts(path, self._parts, stamp)
 
     def _take_up(self, stamp: str, *, resume: bool) -> None:
         if not resume:

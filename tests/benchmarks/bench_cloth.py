@@ -1,4 +1,4 @@
-"""The paper's curtain, parted by two hands: how long a frame of 1/60 s takes, and how deep it is.
+"""The paper's curtain, pushed by two hands: how long a frame of 1/60 s takes, and how deep it is.
 
 The preset "curtain": 720 triangles, 399 vertices, four cameras of 640 x 480 without lens
 distortion, two hands whose silhouettes are drawn exactly, 60 frames a second, steps of 2 ms. The

@@ -1,4 +1,4 @@
-"""The preset "curtain": two hands that part a virtual curtain, as in figure 4 of the paper.
+"""The preset "curtain": two hands that push at a virtual curtain, as in figure 4 of the paper.
 
 The curtain hangs in folds before a window frame: an open sheet of 720 triangles and 399 vertices,
 as many as the paper's. It gives way along y, away from the person.
@@ -79,7 +79,7 @@ def _hand(name: str, side: float) -> Actor:
 
 #: The recording.
 CURTAIN = Preset(
-    description="Two hands part a virtual curtain in a window, and withdraw.",
+    description="Two hands push at a virtual curtain in a window, and withdraw.",
     n_frames=48,
     fps=25.0,
     make_stage=make_stage,
