@@ -18,6 +18,7 @@ from hybridve.cli.demo import demo
 from hybridve.cli.detect import detect
 from hybridve.cli.doctor import doctor
 from hybridve.cli.init import init
+from hybridve.cli.plan import plan
 from hybridve.cli.render import render
 from hybridve.cli.segment import segment
 from hybridve.cli.simulate import simulate
@@ -63,7 +64,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 
 for command in (
-    *(demo, synth, init, board, check, calibrate, convert, segment, detect),
+    *(demo, synth, plan, init, board, check, calibrate, convert, segment, detect),
     *(spacing, sweep, simulate, summary, render, doctor),
 ):
     cli.add_command(command)

@@ -28,6 +28,7 @@ from hybridve.hull.contact.components import (
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.query.walk import spans_in_hull
+from hybridve.hull.report.columns import TABLES
 
 CELL_M = 0.02
 
@@ -71,6 +72,24 @@ def test_rays_of_different_balls_cross_in_a_phantom_that_is_unsure_and_the_balls
     of_a, of_b, of_phantom = (volume_at(volumes, point) for point in (BALL_A, BALL_B, phantom))
     assert len({of_a, of_b, of_phantom}) == 3 == len(volumes)
     assert [real[of_a], real[of_b], real[of_phantom]] == [True, True, False]
+
+
+def test_a_phantom_on_a_neck_is_one_volume_with_what_is_real_and_no_more_is_said() -> None:
+    phantom = crossing(FIRST, BALL_B, SECOND, BALL_A)
+    third = phantom + (BALL_A - phantom) * 3.0 / np.linalg.norm(BALL_A - phantom)
+    balls = [(BALL_A, RADIUS_M), (BALL_B, RADIUS_M)]
+    way = phantom - BALL_A
+    # A string of beads, a cell wide, from the ball half into the phantom.
+    neck = [(BALL_A + share * way, CELL_M / 2.0) for share in np.linspace(0.0, 1.0, 60)]
+
+    volumes, real = tell(hull_of_balls(views_from([FIRST, SECOND, third]), balls + neck))
+
+    # Apart, the phantom is unsure (above). On its neck it is of a volume that holds the ball; where
+    # in it something real is, is not proved, and `component` is called an estimate for it.
+    assert volume_at(volumes, phantom) == volume_at(volumes, BALL_A) != NOWHERE
+    assert real[volume_at(volumes, phantom)]
+    (told,) = [one for table in TABLES for one in table.columns if one.name == "component"]
+    assert told.kind == "estimate"
 
 
 def test_the_proof_rests_on_rays_and_not_on_the_blocks_that_suggest_them() -> None:

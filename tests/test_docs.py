@@ -1,14 +1,24 @@
 """The examples in docstrings are true, and what the pages name is there."""
 
+import dataclasses
 import doctest
 import importlib
 import pkgutil
 import re
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from pydantic import BaseModel
+
+from hybridve.calib.boards.corners_io import COLUMNS
+from hybridve.hull.cad.scene import HingeTable, ObjectTable, TrackTable
+from hybridve.hull.capture.segment import SegmentSettings
+from hybridve.hull.capture.session_tables import TARGETS, CameraTable, SessionTable, WorldPoint
+from hybridve.hull.plan.example import EXAMPLE
+from hybridve.hull.plan.tables import PLAN_TABLES
 
 PROJECT = Path(__file__).resolve().parent.parent
 PACKAGES = ("hybridve.calib", "hybridve.hull", "hybridve.cli")
@@ -118,3 +128,51 @@ def test_files_and_targets_that_a_page_names_are_there(page: str) -> None:
         assert (PROJECT / name).exists(), name
     for name in targets:
         assert re.search(rf"^{name}:", MAKEFILE, re.MULTILINE), f"make {name}"
+
+
+TABLES: list[tuple[type[BaseModel], str]] = [
+    *((table, "data/README.md") for table in (SessionTable, CameraTable, WorldPoint)),
+    *((table, "data/README.md") for table in (ObjectTable, HingeTable, TrackTable)),
+    *((table, "calib/README.md") for table in TARGETS.values()),
+]
+
+
+@pytest.mark.parametrize(("table", "page"), TABLES, ids=[table.__name__ for table, _ in TABLES])
+def test_a_page_names_every_key_of_a_table(table: type[BaseModel], page: str) -> None:
+    named = (PROJECT / page).read_text(encoding="utf-8")
+
+    keys = {field.alias or name for name, field in table.model_fields.items()} - {"point"}
+
+    assert {key for key in keys if not re.search(rf"\b{key}\b( =|`|\]|\W*=)", named)} == set()
+
+
+def test_the_page_of_the_files_tells_every_default_of_the_segmentation() -> None:
+    text = (PROJECT / "data/README.md").read_text(encoding="utf-8")
+    told: dict[str, str] = {}
+    for names, defaults in re.findall(
+        r"^\| (`\w+`(?:, `\w+`)*) \| ([\d., ]+) \|", text, re.MULTILINE
+    ):
+        told |= dict(zip(re.findall(r"\w+", names), defaults.split(", "), strict=True))
+
+    for field in dataclasses.fields(SegmentSettings):
+        assert float(told[field.name]) == field.default, field.name
+
+
+def test_the_page_of_boards_tells_every_column_of_a_corner_file() -> None:
+    text = (PROJECT / "calib/README.md").read_text(encoding="utf-8").split("## Corners found")[1]
+
+    assert {name for name in COLUMNS if f"`{name}`" not in text.split("\n## ")[0]} == set()
+
+
+def test_the_example_of_a_plan_says_every_key_with_its_default() -> None:
+    text = re.sub(r"^# (?=\w+ = |\[)", "", EXAMPLE.partition("[volume]")[2], flags=re.MULTILINE)
+    told = tomllib.loads("[volume]" + text)
+
+    for name, table in PLAN_TABLES.items():
+        said = told[name][0] if isinstance(told[name], list) else told[name]
+        keys = table.model_fields
+        assert set(keys) - set(said) <= {"size_px", "across_deg"}, name
+        for key, field in keys.items():
+            if key in said and not field.is_required() and field.default is not None:
+                value = tuple(said[key]) if isinstance(said[key], list) else said[key]
+                assert value == field.default, f"{name}.{key}"

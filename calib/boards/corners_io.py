@@ -25,7 +25,8 @@ from hybridve.calib.boards.markers import Charuco
 from hybridve.calib.boards.target import Chessboard, fit_homography, list_corners
 from hybridve.calib.errors import CalibrationError
 
-_COLUMNS = ("image", "frame", "board", "corner", "x", "y")
+#: What the columns of a CSV of points may be.
+COLUMNS = ("image", "frame", "board", "corner", "x", "y")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +130,7 @@ def _rows_of_table(path: Path) -> list[tuple[int, dict[str, str]]] | None:
     if "x" not in header or "y" not in header:
         raise CalibrationError(
             f"{path}: has the columns {', '.join(header)}; expected x and y, and perhaps "
-            f"{', '.join(_COLUMNS[:4])}"
+            f"{', '.join(COLUMNS[:4])}"
         )
     for number, line in lines[1:]:
         if len(line) != len(header):

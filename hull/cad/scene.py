@@ -63,7 +63,9 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class _HingeTable(_Table):
+class HingeTable(_Table):
+    """A hinge, as an object's ``hinge`` describes it."""
+
     axis: _Vector
     anchor_mm: _Vector
     angles: str
@@ -76,7 +78,9 @@ class _HingeTable(_Table):
         return axis
 
 
-class _TrackTable(_Table):
+class TrackTable(_Table):
+    """A tracker on a part, as an object's ``track`` describes it."""
+
     poses: str
     object_from_tracker_mm: _Vector = (0.0, 0.0, 0.0)
     rotate_deg: _Vector = (0.0, 0.0, 0.0)
@@ -86,7 +90,9 @@ class _TrackTable(_Table):
 _MOTIONS = ("poses", "hinge", "track")
 
 
-class _ObjectTable(_Table):
+class ObjectTable(_Table):
+    """An ``[[object]]`` of a scene."""
+
     name: Name
     mesh: str
     unit: Literal["m", "cm", "mm", "in", "ft"] | None = None
@@ -100,8 +106,8 @@ class _ObjectTable(_Table):
     reference_point_mm: _Vector | None = None
     recovery_direction: _Vector | None = None
     poses: str | None = None
-    hinge: _HingeTable | None = None
-    track: _TrackTable | None = None
+    hinge: HingeTable | None = None
+    track: TrackTable | None = None
 
     @field_validator("recovery_direction")
     @classmethod
@@ -111,7 +117,7 @@ class _ObjectTable(_Table):
         return direction
 
     @model_validator(mode="after")
-    def _moves_in_one_way(self) -> "_ObjectTable":
+    def _moves_in_one_way(self) -> "ObjectTable":
         given = [key for key in _MOTIONS if getattr(self, key) is not None]
         if len(given) > 1:
             raise ValueError(f"has {' and '.join(given)}; an object moves in one way, keep one")
@@ -132,7 +138,7 @@ class _SceneTable(_Table):
     format: Literal["hybridve-scene"]
     version: Literal[1]
     root: str = "."
-    object: Annotated[list[_ObjectTable], Field(min_length=1)]
+    object: Annotated[list[ObjectTable], Field(min_length=1)]
     effect: list[_EffectTable] = []
 
 
@@ -361,7 +367,7 @@ def _refuse_missing_units(table: dict[str, Any], path: Path) -> None:
             )
 
 
-def _refuse_what_the_kind_has(entry: _ObjectTable, kind: str, label: str) -> None:
+def _refuse_what_the_kind_has(entry: ObjectTable, kind: str, label: str) -> None:
     """Refuse keys that have no meaning for a kind of file."""
     if kind in TESSELLATED and entry.unit is not None:
         raise _KeyError(
@@ -375,7 +381,7 @@ def _refuse_what_the_kind_has(entry: _ObjectTable, kind: str, label: str) -> Non
         )
 
 
-def _motion_file(entry: _ObjectTable) -> tuple[str, str] | None:
+def _motion_file(entry: ObjectTable) -> tuple[str, str] | None:
     """Return the key that names the file of an object's motion, and that name; None if at rest."""
     if entry.poses is not None:
         return "poses", entry.poses
@@ -386,7 +392,7 @@ def _motion_file(entry: _ObjectTable) -> tuple[str, str] | None:
     return None
 
 
-def _motion(entry: _ObjectTable, root: Path, label: str) -> Motion | None:
+def _motion(entry: ObjectTable, root: Path, label: str) -> Motion | None:
     """Return how an object moves; None if it does not."""
     told_by = _motion_file(entry)
     if told_by is None:
@@ -414,12 +420,12 @@ def _motion(entry: _ObjectTable, root: Path, label: str) -> Motion | None:
     return Motion.of_track(poses, object_from_tracker)
 
 
-def _placement(entry: _ObjectTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _placement(entry: ObjectTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how the scene turns a mesh (3, 3), and by how much it moves it (3,), metres."""
     return rotation_about_axes(entry.rotate_deg), np.array(entry.translate_mm) / 1000.0
 
 
-def _place(entry: _ObjectTable, cad: CadFile, motion: Motion | None) -> Iterator[SceneObject]:
+def _place(entry: ObjectTable, cad: CadFile, motion: Motion | None) -> Iterator[SceneObject]:
     """Yield the objects that a file becomes."""
     up = entry.up or cad.up
     unit_m = UNITS_M[entry.unit] if entry.unit is not None else cad.unit_m

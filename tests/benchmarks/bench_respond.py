@@ -22,6 +22,7 @@ from helpers.response import angle_deg, ball_exits, random_unit
 from numpy.typing import NDArray
 
 from hybridve.hull.contact.respond import Response, ResponseSettings, respond
+from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.walk import boundary_cameras, silhouette_normal, spans_in_hull
 
@@ -36,15 +37,17 @@ def hull() -> Hull:
 
 
 @pytest.fixture(scope="module")
-def points() -> Points:
+def points(hull: Hull) -> Points:
     """CP_obj, V_rec and N_hull in closed form, (3,) each."""
     rng, views = np.random.default_rng(0), ring_views()
-    found = []
-    for _ in range(200):
+    found: Points = []
+    while len(found) < 200:
         unit = random_unit(rng)
         end = ball_exits(views, np.zeros(3), RADIUS_M, np.zeros(3), unit)[0]
         start = (end.distance_m - rng.uniform(0.001, 0.04)) * unit
-        found.append((start, unit, end.normal))
+        # Of pixels, the hull may end a few millimetres before that of the ball's own cones.
+        if contains_points(hull, start[None])[0]:
+            found.append((start, unit, end.normal))
     return found
 
 

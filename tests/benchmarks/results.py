@@ -20,6 +20,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -170,25 +171,38 @@ def numbers_of(told: Mapping[str, Any]) -> dict[str, float]:
     return found
 
 
-def measure(files: Iterable[Path]) -> dict[str, float]:
-    """Run benchmarks at full size, the scripts after the others, and return their numbers."""
+def measure(files: Iterable[Path]) -> tuple[dict[str, float], list[str]]:
+    """Run benchmarks at full size, the scripts after the others.
+
+    One that fails takes nothing from the others: returned are the numbers of all that did not, and
+    what failed.
+    """
     files = list(files)
     for_pytest = [str(path) for path in files if not is_script(path)]
     numbers: dict[str, float] = {}
+    failed: list[str] = []
     if for_pytest:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "benchmarks.json"
             command = [sys.executable, "-m", "pytest", *for_pytest, "--full"]
             command += ["--benchmark-columns=median,iqr,min,rounds", "--benchmark-sort=fullname"]
-            subprocess.run([*command, f"--benchmark-json={path}"], check=True)
-            numbers |= numbers_of(json.loads(path.read_text(encoding="utf-8")))
+            done = subprocess.run([*command, f"--benchmark-json={path}"])
+            if done.returncode:
+                failed.append(f"pytest (status {done.returncode}, see above)")
+            if path.is_file() and path.stat().st_size:
+                numbers |= numbers_of(json.loads(path.read_text(encoding="utf-8")))
     for path in files:
         if is_script(path):
             sys.stdout.write(f"{path.stem}\n")
-            told = load_script(path)(_ARGUMENTS.get(path.stem, []))
+            try:
+                told = load_script(path)(_ARGUMENTS.get(path.stem, []))
+            except Exception:
+                traceback.print_exc()
+                failed.append(path.stem)
+                continue
             numbers |= {f"{path.stem}.{name}": value for name, value in told.items()}
     numbers |= hard_cases()
-    return {key: float(f"{value:.7g}") for key, value in numbers.items()}
+    return {key: float(f"{value:.7g}") for key, value in numbers.items()}, failed
 
 
 def hard_cases() -> dict[str, float]:
@@ -213,9 +227,12 @@ def main() -> None:
     asked = parser.parse_args()
     run = this_run()
     files = [path for path in FILES if not asked.names or path.stem in asked.names]
-    table = merged(read_table(), measure(files), run)
+    numbers, failed = measure(files)
+    table = merged(read_table(), numbers, run)
     write_table(table)
     sys.stdout.write(text_of({key: each for key, each in table.items() if each.run == run}))
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}; what was measured stands in the table")
 
 
 if __name__ == "__main__":
