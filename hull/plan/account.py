@@ -70,8 +70,8 @@ class PlannedCamera(Told):
     seen_share : float
         The share of the volume in which it sees all of the ball.
     square_px : float
-        How small the board's squares (its smallest gap between points) are in its picture of the
-        board on the floor; 0 where it does not see all of it.
+        How small the board's smallest square (of an AprilGrid: tag) is in its picture of the board
+        on the floor; 0 where it does not see all of it.
     """
 
     name: str

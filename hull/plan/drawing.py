@@ -132,7 +132,7 @@ def _camera(one: CameraTable, lens: LensTable) -> Camera:
 
 
 def square_px(camera: Camera, board: Board, world_from_board: Pose) -> float:
-    """Return how small the closest two neighbouring points of a board are in a picture, pixels.
+    """Return how small the smallest square, or tag, of a board is in a picture, pixels.
 
     0 where the board is not wholly in the picture, or shows its back.
     """
@@ -142,8 +142,7 @@ def square_px(camera: Camera, board: Board, world_from_board: Pose) -> float:
         return 0.0
     points = board.points_board
     apart_m = np.linalg.norm(points[:, None] - points[None], axis=2)
-    np.fill_diagonal(apart_m, np.inf)
-    first, second = np.nonzero(apart_m < 1.01 * apart_m.min())
+    first, second = np.nonzero(np.abs(apart_m - board.square_m) < 0.01 * board.square_m)
     return float(np.linalg.norm(pixels[first] - pixels[second], axis=1).min())
 
 
