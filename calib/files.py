@@ -1,5 +1,6 @@
-"""Files that appear under their names when they are complete, or not at all."""
+"""Files that appear under their names when they are complete, or not at all; and missing ones."""
 
+import difflib
 import os
 import tempfile
 from collections.abc import Iterator
@@ -33,3 +34,19 @@ def appearing(path: Path, *, is_contended: bool = False) -> Iterator[Path]:
         with suppress(OSError):  # there may be none, nor a folder to remove it from
             partial.unlink()
         raise
+
+
+def nearly(path: Path) -> str:
+    """Return, for a message, what is there that has nearly the name of a file that is not.
+
+    Examples
+    --------
+    >>> nearly(Path("/there is no such folder/a.csv"))
+    '; there is no folder /there is no such folder'
+    """
+    try:
+        names = [one.name for one in path.parent.iterdir() if one.is_file()]
+    except OSError:
+        return f"; there is no folder {path.parent}"
+    close = difflib.get_close_matches(path.name, names, n=1, cutoff=0.75)
+    return f"; did you mean {close[0]!r}?" if close else ""

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.avi_index import AviFrames, avi_frames, is_avi
 from hybridve.calib.errors import SessionError
+from hybridve.calib.files import nearly
 
 _log = logging.getLogger(__name__)
 
@@ -355,7 +356,7 @@ def open_source(root: Path, name: str) -> FrameSource:
             name, tuple(sorted(found, key=lambda path: natural_order(str(path)))), is_video=False
         )
     if not path.is_file():
-        raise SessionError(f"there is no file {name!r} in {root}{_nearly(path)}")
+        raise SessionError(f"there is no file {name!r} in {root}{nearly(path)}")
     is_video = path.suffix.lower() not in _IMAGE_SUFFIXES
     if is_video:
         _open_video(path, name).release()
@@ -389,17 +390,26 @@ def _matching(root: Path, name: str) -> list[Path]:
             if last == either:
                 _log.info("%s: no file matches but for capitals; %d do", name, len(found))
             return found
-    raise SessionError(f"no file matches {name!r} in {root}")
+    raise SessionError(f"no file matches {name!r} in {root}{_instead(base, relative.parent)}")
 
 
-def _nearly(path: Path) -> str:
-    """Return, for a message, what is there that has nearly the name of a file that is not."""
-    try:
-        names = [one.name for one in path.parent.iterdir() if one.is_file()]
-    except OSError:
-        return f"; there is no folder {path.parent}"
-    close = difflib.get_close_matches(path.name, names, n=1, cutoff=0.75)
-    return f"; did you mean {close[0]!r}?" if close else ""
+def _instead(base: Path, pattern: Path) -> str:
+    """Return, for a message, what is there where no file matches: in a folder, or in its place."""
+    if any(mark in str(pattern) for mark in "*?["):
+        return "; look at the pattern"
+    folder = base
+    for part in pattern.parts:
+        if not (folder / part).is_dir():
+            names = [one.name for one in folder.iterdir() if one.is_dir()]
+            close = difflib.get_close_matches(part, names, n=1, cutoff=0.6)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            return f"; there is no folder {folder / part}{hint}"
+        folder /= part
+    names = sorted((one.name for one in folder.iterdir() if one.is_file()), key=natural_order)
+    if not names:
+        return "; there is no file in that folder"
+    count = "1 file" if len(names) == 1 else f"{len(names)} files"
+    return f"; there is {count} in that folder, as {names[0]!r}"
 
 
 def read_image(path: Path, bits: int = 16) -> NDArray[np.uint8]:

@@ -129,23 +129,28 @@ def calibrate(
       hybridve calibrate data/horseman --max-error-mm 10
       hybridve calibrate --check yesterday/rig/rig.json today
     """
-    from hybridve.hull.capture.session import load_session
+    from hybridve.calib.errors import ask_all
+    from hybridve.hull.capture.inspection import opened_session
+    from hybridve.hull.report.write import refuse_existing_in
 
-    loaded = load_session(session)
     terminal = Terminal(enabled=progress)
     if checked is not None:
-        _check(loaded, checked, rig_unit, terminal, as_json=as_json)
+        _check(opened_session(session), checked, rig_unit, terminal, as_json=as_json)
         return
     if rig_unit is not None:
         raise click.UsageError("--rig-unit goes with --check")
+    folder = output or (session if session.is_dir() else session.parent) / "rig"
+    loaded, _ = ask_all(
+        lambda: opened_session(session),
+        lambda: refuse_existing_in(folder, "rig.json", overwrite=overwrite),
+    )
     _calibrate(
         loaded,
-        output or loaded.folder / "rig",
+        folder,
         terminal,
         box_world=box_world,
         max_error_m=None if max_error_mm is None else max_error_mm / 1000.0,
         with_page=not no_page,
-        overwrite=overwrite,
         as_json=as_json,
     )
 
@@ -192,7 +197,6 @@ def _calibrate(
     box_world: "Box | None",
     max_error_m: float | None,
     with_page: bool,
-    overwrite: bool,
     as_json: bool,
 ) -> None:
     from hybridve.calib.formats.colmap import write_colmap_model
@@ -200,12 +204,8 @@ def _calibrate(
     from hybridve.calib.judging.certificate import certify, working_volume
     from hybridve.calib.plain import to_json
     from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
-    from hybridve.hull.report.write import refuse_existing
 
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    folder.mkdir(exist_ok=True)
     path = folder / "rig.json"
-    refuse_existing(path, overwrite=overwrite)
     certificate = None
     if session.rig_file is not None:
         rig = take_elsewhere(session, terminal.stage)
@@ -242,6 +242,7 @@ def _write_certificate(
     text = json.dumps(certificate.to_dict(), indent=1, allow_nan=False) + "\n"
     path = folder / "certificate.json"
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         with appearing(path) as partial:
             partial.write_text(text, encoding="utf-8")
     except OSError as error:

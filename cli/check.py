@@ -77,6 +77,8 @@ def check(
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
     if picture is not None:
+        if picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+            raise click.UsageError(f"{picture}: pictures are .png or .jpg")
         refuse_existing(picture, overwrite=overwrite)
     settings = options.evaluation_of(
         clearance_mm=0.1,

@@ -212,4 +212,6 @@ def _cell_text(cell: dict[str, Any] | None) -> str:
     if cell["required_clearance_m"] and cell["frames_below_required"]:
         below = f"{1e3 * cell['required_clearance_m']:g} mm"
         parts.append(f"{options.counted(cell['frames_below_required'], 'frame')} below {below}")
+    if cell["verdict"] == "kept" and cell["kept_rests_on"]:
+        parts.append(f"rests on {cell['kept_rests_on']}")
     return ", ".join(parts)

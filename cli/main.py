@@ -114,10 +114,23 @@ def main() -> NoReturn:
     try:
         cli.main(_in_order(sys.argv[1:]), standalone_mode=False)
     except click.ClickException as error:  # wrong usage
-        error.show()
+        context = getattr(error, "ctx", None)
+        command = "hybridve" if context is None else context.command_path
+        text = error.format_message().rstrip(".")
+        click.echo(f"error: {text}; `{command} --help` shows what there is", err=True)
         sys.exit(error.exit_code)
     except HybridveError as error:
-        click.echo(f"error: {error}", err=True)
+        for line in error.lines:
+            click.echo(f"error: {line}", err=True)
+        sys.exit(1)
+    except ImportError as error:
+        if (error.name or "").startswith("hybridve"):
+            raise
+        click.echo(
+            f"error: {error.name or 'a library'} cannot be loaded ({error}); "
+            "`hybridve doctor` tells what is missing and what installs it",
+            err=True,
+        )
         sys.exit(1)
     except (KeyboardInterrupt, click.Abort):
         _leave_interrupted()

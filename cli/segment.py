@@ -40,29 +40,32 @@ def segment(
     """
     import cv2
 
+    from hybridve.calib.errors import ask_all
     from hybridve.calib.plain import to_json
+    from hybridve.hull.agreement.blank import BlankLooks
     from hybridve.hull.agreement.record import SessionAgreement
+    from hybridve.hull.capture.inspection import opened_session
     from hybridve.hull.capture.recording import (
         FrameRange,
         check_lengths,
-        check_recording,
         claimed_length,
+        recorded_sizes,
         segmented_frames,
         silhouette_stamp,
     )
     from hybridve.hull.capture.rig import has_rig, load_rig, rig_digest
     from hybridve.hull.capture.room_check import check_room
-    from hybridve.hull.capture.session import load_session
     from hybridve.hull.capture.silhouette_io import SilhouetteWriter
     from hybridve.hull.report.write import refuse_existing
-    from hybridve.hull.trust import Desk
+    from hybridve.hull.trust import Desk, blank_causes
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
     terminal = Terminal(enabled=progress)
-    loaded = load_session(session)
-    output = loaded.folder / "silhouettes.h5"
-    refuse_existing(output, overwrite=overwrite)
-    sizes_px = check_recording(loaded)
+    output = (session if session.is_dir() else session.parent) / "silhouettes.h5"
+    loaded, _ = ask_all(
+        lambda: opened_session(session), lambda: refuse_existing(output, overwrite=overwrite)
+    )
+    sizes_px = recorded_sizes(loaded)
     check_lengths(loaded, FrameRange())
     digest, desk = None, None
     if not unconfirmed and has_rig(loaded):
@@ -71,7 +74,7 @@ def segment(
         digest, desk = rig_digest(rig), Desk.of(loaded, rig, room)
 
     names = [camera.name for camera in loaded.cameras]
-    object_pixels = [0] * len(names)
+    looks = BlankLooks()
     n_frames, n_invalid = 0, 0
     recording = segmented_frames(loaded, FrameRange(), progress=terminal.stage)
     with (
@@ -88,14 +91,17 @@ def segment(
             if masks is None:
                 n_invalid += 1
             else:
-                for camera, mask in enumerate(masks):
-                    object_pixels[camera] += int(mask.sum())
+                looks.take(frame.index, masks)
             advance()
-    agreement = SessionAgreement() if desk is None else desk.judge()
-    shares = {
-        name: pixels / (size[0] * size[1] * max(n_frames - n_invalid, 1))
-        for name, pixels, size in zip(names, object_pixels, sizes_px, strict=True)
-    }
+    agreement = SessionAgreement()
+    if desk is not None:
+        agreement = desk.judge()
+    elif looks.index:
+        span = (looks.index[0], looks.index[-1])
+        causes = blank_causes(loaded, looks.shares, looks.is_same, span)
+        agreement = SessionAgreement(causes=causes)
+    means = looks.shares.mean(axis=0).tolist() if looks.index else [0.0] * len(names)
+    shares = dict(zip(names, means, strict=True))
     if as_json:
         click.echo(
             json.dumps(

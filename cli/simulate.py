@@ -93,6 +93,8 @@ def simulate(
     cv2.setNumThreads(1)
     if picture is not None:
         options.refuse_suffix(picture)
+        if picture == output:
+            raise click.UsageError(f"{output} cannot be both simulation and picture")
         refuse_existing(picture, overwrite=overwrite)
     settings = SimulateSettings(
         EvaluateSettings(frames=frames, viewport=viewport, drop_cameras=drop_cameras),

@@ -292,6 +292,7 @@ def _column(one: "SessionSpacing") -> dict[str, str]:
     }
     if one.at_zero is not None:
         text["frames violated at 0"] = _count(*one.at_zero, n_valid)
+    text["rests on"] = one.agreement.rests_on
     left_out = len(frames.index) - n_valid
     text["frames left out"] = f"{left_out}" if left_out else ""
     return text

@@ -168,11 +168,14 @@ def _overall_text(numbers: dict[str, Any]) -> str:
 def _verdict_text(numbers: dict[str, Any]) -> str:
     every = len(numbers["objects"])
     kept = numbers["objects_by_verdict"].get("kept", 0)
+    is_any_kept = any("kept" in found["frames_by_verdict"] for found in numbers["objects"])
+    rests_on = numbers["kept_rests_on"] if is_any_kept else ""
+    rests = f"; what is kept rests on {rests_on}" if rests_on else ""
     if kept == every:
         whom = "the object keeps" if every == 1 else f"all {every} objects keep"
-        return f"kept: {whom} the distance"
+        return f"kept: {whom} the distance{rests}"
     found = ", ".join(f"{count} {one}" for one, count in numbers["objects_by_verdict"].items())
-    return f"{numbers['verdict']}: {kept} of {every} objects keep their distance ({found})"
+    return f"{numbers['verdict']}: {kept} of {every} objects keep their distance ({found}){rests}"
 
 
 def _frames_text(frames_by_verdict: dict[str, int]) -> str:

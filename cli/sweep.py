@@ -166,8 +166,9 @@ def sweep(
     """
     import cv2
 
+    from hybridve.calib.errors import ask_all
     from hybridve.hull.cad.scene import load_scene
-    from hybridve.hull.capture.session import load_session
+    from hybridve.hull.capture.inspection import opened_session
     from hybridve.hull.report.sweep_file import read_sweep, sweep_as_dict, write_sweep
     from hybridve.hull.report.write import refuse_existing
     from hybridve.hull.sweep.picture import write_picture_of
@@ -197,9 +198,8 @@ def sweep(
         open_at_m=open_at_mm / 1e3,
         accuracy_m=None if accuracy_mm is None else accuracy_mm / 1e3,
     )
-    measured = sweep_session(
-        load_session(session), load_scene(scene), asked, options.command_line(), terminal
-    )
+    opened, layout = ask_all(lambda: opened_session(session), lambda: load_scene(scene))
+    measured = sweep_session(opened, layout, asked, options.command_line(), terminal)
     write_sweep(output, measured)
     written = read_sweep(output)
     write_picture_of(picture, written)
@@ -227,9 +227,10 @@ def _sweep_simulation(
     terminal: Terminal,
 ) -> "SimulationSweep":
     """Return what each value costs a simulation."""
+    from hybridve.calib.errors import ask_all
     from hybridve.hull.cad.scene import load_scene
+    from hybridve.hull.capture.inspection import opened_session
     from hybridve.hull.capture.recording import FrameRange
-    from hybridve.hull.capture.session import load_session
     from hybridve.hull.chain import EvaluateSettings
     from hybridve.hull.simulate import SimulateSettings
     from hybridve.hull.sweep.simulation import SimulationSweepRequest, sweep_simulation
@@ -239,9 +240,8 @@ def _sweep_simulation(
     evaluation = EvaluateSettings(frames=frames or FrameRange())
     settings = SimulateSettings(evaluation, engine=engines[0] if engines else "auto")
     asked = SimulationSweepRequest(over, tuple(map(float, values)), settings, repeats)
-    return sweep_simulation(
-        load_session(session), load_scene(scene), asked, options.command_line(), terminal
-    )
+    opened, layout = ask_all(lambda: opened_session(session), lambda: load_scene(scene))
+    return sweep_simulation(opened, layout, asked, options.command_line(), terminal)
 
 
 def _tell_simulation(

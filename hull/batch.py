@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from hybridve.calib.errors import HybridveError, ReportError
+from hybridve.calib.errors import HybridveError, ReportError, ask_all
 from hybridve.hull.about import (
     about_objects,
     about_rig,
@@ -18,7 +18,8 @@ from hybridve.hull.about import (
     stored_meshes,
 )
 from hybridve.hull.cad.scene import Scene, load_scene
-from hybridve.hull.capture.session import Session, load_session
+from hybridve.hull.capture.inspection import opened_session
+from hybridve.hull.capture.session import Session
 from hybridve.hull.chain import Chain, EvaluateSettings, count_frames, make_chain
 from hybridve.hull.evaluate import evaluate
 from hybridve.hull.query.choose import open_engine
@@ -28,7 +29,7 @@ from hybridve.hull.report.machine import Run
 from hybridve.hull.report.read import read_report
 from hybridve.hull.report.schema import ReportHeader
 from hybridve.hull.report.summarize import summarize
-from hybridve.hull.report.write import ReportWriter, refuse_existing
+from hybridve.hull.report.write import ReportWriter, refuse_existing, refuse_result
 from hybridve.hull.trust import judge_cameras
 from hybridve.hull.watcher import Watcher
 
@@ -67,10 +68,13 @@ def detect_one(
     session: Path, scene: Path, output: Path, settings: DetectSettings, watcher: Watcher
 ) -> None:
     """Evaluate a recording against a layout into a report."""
-    refuse_existing(output, overwrite=settings.overwrite)
-    loaded = load_scene(scene)
+    _, loaded, opened = ask_all(
+        lambda: refuse_result(output, resume=settings.resume, overwrite=settings.overwrite),
+        lambda: load_scene(scene),
+        lambda: opened_session(session, settings.evaluation.drop_cameras),
+    )
     _say_not_simulated(loaded, watcher)
-    chain = make_chain(load_session(session), loaded, settings.evaluation, watcher.stage)
+    chain = make_chain(opened, loaded, settings.evaluation, watcher.stage)
     write_report(chain, output, settings, watcher)
 
 
@@ -125,6 +129,7 @@ def write_report(chain: Chain, output: Path, settings: DetectSettings, watcher: 
                     chain.views,
                     writer.outlines(),
                     chain.room,
+                    lenses=chain.undistortions,
                     is_still=not chain.tracks,
                 )
             )
@@ -165,7 +170,12 @@ def detect_every(
             table,
         ]:
             refuse_existing(path, overwrite=settings.overwrite)
-    loaded = {name: _load(load_session, path, watcher) for name, path in sessions.items()}
+    dropped = settings.evaluation.drop_cameras
+
+    def opened(path: Path) -> Session:
+        return opened_session(path, dropped)
+
+    loaded = {name: _load(opened, path, watcher) for name, path in sessions.items()}
     layouts = {name: _load(load_scene, path, watcher) for name, path in scenes.items()}
     for scene in layouts.values():
         if isinstance(scene, Scene):
@@ -184,7 +194,8 @@ def detect_every(
                 found = _made_or_finished(session, scene, path, settings, watcher)
                 pairs.append(Pair(name, layout, found))
             except HybridveError as error:
-                watcher.warn(f"error: {name}, {layout}: {error}")
+                for line in error.lines:
+                    watcher.warn(f"error: {name}, {layout}: {line}")
                 pairs.append(Pair(name, layout, None, str(error)))
     return pairs
 
@@ -196,7 +207,8 @@ def _load(
     try:
         return loader(path)
     except HybridveError as error:
-        watcher.warn(f"error: {error}")
+        for line in error.lines:
+            watcher.warn(f"error: {line}")
         return error
 
 

@@ -26,7 +26,6 @@ from hybridve.hull.cad.scene import Scene, SceneObject
 from hybridve.hull.capture.recording import (
     FrameRange,
     check_lengths,
-    check_recording,
     claimed_length,
     silhouettes_of,
     stored_silhouettes,
@@ -213,7 +212,6 @@ def make_chain(
     tracks = read_tracks(session, rig)
     silhouettes = stored_silhouettes(session, rig_digest(rig))
     if silhouettes is None:
-        check_recording(session)
         check_lengths(session, settings.frames)
     views, undistortions = rig_views(session, first_rig(rig, tracks))
     if not tracks and (seen := common_view(views)).kind == "none":

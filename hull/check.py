@@ -15,19 +15,20 @@ import logging
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import HybridveError, SessionError
+from hybridve.calib.errors import Faults, SessionError
 from hybridve.calib.plain import Told
 from hybridve.calib.rig import Rig
+from hybridve.hull.agreement.blank import BlankKind, BlankLooks, blank_cameras, blank_message
 from hybridve.hull.agreement.common_view import CommonView, common_view
 from hybridve.hull.agreement.outlines import FrameOutlines
 from hybridve.hull.agreement.record import SessionAgreement
@@ -35,17 +36,16 @@ from hybridve.hull.agreement.sight import sight_of
 from hybridve.hull.batch import DetectSettings, write_report
 from hybridve.hull.cad.scene import Scene, SceneObject, load_scene
 from hybridve.hull.capture.inspection import (
-    HEADER_SLACK,
     CameraFiles,
     compare_cameras,
     inspect_camera,
-    missing_files,
 )
 from hybridve.hull.capture.recording import (
+    HEADER_SLACK,
     FrameRange,
     Mask,
     check_lengths,
-    check_recording,
+    recorded_sizes,
     segmented_frames,
     undistort_mask,
 )
@@ -61,8 +61,6 @@ from hybridve.hull.report.read import read_report
 from hybridve.hull.trust import Witness, judge_cameras
 from hybridve.hull.watcher import Watcher
 
-_T = TypeVar("_T")
-
 #: Frames that are looked at, spread over the recording from its first to its last.
 N_LOOKS = 9
 
@@ -72,8 +70,8 @@ _MOST_READ = 3000
 #: Frames that are evaluated, in the middle of those looked at, to tell what a run takes.
 _N_TRIED = 6
 
-#: A camera that is object to such a share, on average, is asked whether its masks are inverted.
-_NEARLY_ALL = 0.9
+#: Frames spread over a recording in which a silhouette is the very same, from which on it is told.
+_LEAST_SAME = 3
 
 #: How large a file's parts are together, in distances from the cameras to what they look at: below
 #: the first and above the second its unit is asked for. A part of 1.5 mm in a room of 3 m is the
@@ -258,12 +256,11 @@ def check_session(
 def _check(
     path: Path, scene: Path | None, settings: EvaluateSettings, watcher: Watcher, notes: list[str]
 ) -> tuple[SessionCheck, Look]:
-    problems: list[str] = []
-    asked = _Asked(problems)
+    asked = Faults()
+    problems = asked.lines
     look = Look(asked.of(lambda: load_session(path)))
     if look.session is None:
-        told = asked.of(lambda: missing_files(path)) or problems
-        return SessionCheck(str(path), problems=tuple(dict.fromkeys(told))), look
+        return SessionCheck(str(path), problems=tuple(problems)), look
     session = look.session
     layout = None if scene is None else asked.of(lambda: load_scene(scene))
     effects = () if layout is None else asked.of(lambda: _effects(layout)) or ()
@@ -347,21 +344,6 @@ def _warnings_noted(notes: list[str]) -> Iterator[None]:
         logger.removeHandler(noting)
 
 
-class _Asked:
-    """Asks, and keeps as a problem what an answer fails with."""
-
-    def __init__(self, problems: list[str]) -> None:
-        self._problems = problems
-
-    def of(self, ask: Callable[[], _T]) -> _T | None:
-        """Return the answer; None where there is none."""
-        try:
-            return ask()
-        except HybridveError as error:
-            self._problems.append(str(error))
-            return None
-
-
 def _effects(layout: Scene) -> tuple[str, ...]:
     return tuple(str(entry.table.kind) for entry, _ in read_entries(layout))
 
@@ -405,27 +387,7 @@ def _looks(session: Session, frames: _Frames, notes: list[str]) -> tuple[CameraL
         masks = [None if every is None else every[number] for every in frames.masks]
         shares = tuple(None if one is None else float(one.mean()) for one in masks)
         looks.append(CameraLooks(camera.name, shares))
-        known = [share for share in shares if share is not None]
-        if not known:
-            continue
-        seen = f"in all {len(known)} frames looked at" if len(known) > 1 else "in its one frame"
-        ask = (
-            "are the masks black on white?"
-            if camera.has_masks
-            else "is the background of this room, in this light?"
-        )
-        where = f"{session.path}: camera {camera.name!r}"
-        if np.mean(known) > _NEARLY_ALL:
-            notes.append(f"{where} is {np.mean(known):.0%} object; {ask}")
-        elif max(known) == 0.0:
-            notes.append(
-                f"{where} is empty {seen}; does it see where the task is, and "
-                f"{'are these its masks' if camera.has_masks else 'is this its recording'}?"
-            )
-        elif len(known) > 2 and _is_always_same(masks):
-            notes.append(
-                f"{where} shows the very same silhouette {seen}; is one picture there many times?"
-            )
+    notes += _blank_notes(session, frames)
     unread = [at for at, masks in enumerate(frames.masks) if masks is None]
     if unread:
         notes.append(
@@ -441,9 +403,23 @@ def _looks(session: Session, frames: _Frames, notes: list[str]) -> tuple[CameraL
     return tuple(looks)
 
 
-def _is_always_same(masks: Sequence[Mask | None]) -> bool:
-    known = [mask for mask in masks if mask is not None]
-    return all(np.array_equal(known[0], mask) for mask in known[1:])
+def _blank_notes(session: Session, frames: _Frames) -> list[str]:
+    """Return what there is to say of cameras that show one and the same in all frames."""
+    looks = BlankLooks()
+    for index, masks in zip(frames.index, frames.masks, strict=True):
+        if masks is not None:
+            looks.take(index, masks)
+    names = [camera.name for camera in session.cameras]
+    return [
+        f"{session.path}: "
+        + blank_message(
+            one,
+            names,
+            has_masks=session.cameras[one.cameras[0]].has_masks,
+            looked=" looked at",
+        )
+        for one in blank_cameras(looks.shares, looks.is_same, _LEAST_SAME)
+    ]
 
 
 def _still_views(session: Session, rig: Rig) -> Views | None:
@@ -469,8 +445,10 @@ def _agreement(session: Session, rig: Rig, room: RoomCheck, frames: _Frames) -> 
         views = moved_views(session, rig, tracks, index, first, lenses)
         flat = [undistort_mask(mask, lens) for mask, lens in zip(masks, lenses, strict=True)]
         seen.append(witness.look(index, make_hull(views, flat))[1])
-    found = judge_cameras(session, first, seen, room, is_still=not tracks)
-    return replace(found, causes=tuple(one for one in found.causes if one.kind != "frames"))
+    found = judge_cameras(session, first, seen, room, lenses=lenses, is_still=not tracks)
+    # What shows one and the same is noted of the silhouettes themselves, rig or not.
+    left_out = {"frames", *get_args(BlankKind)}
+    return replace(found, causes=tuple(one for one in found.causes if one.kind not in left_out))
 
 
 # --- The scene --------------------------------------------------------------------------------
@@ -608,7 +586,7 @@ def _trial(
 
 def _store(session: Session, frames: FrameRange, path: Path) -> None:
     """Keep the silhouettes of a few frames, so that they are cut out once; each at its number."""
-    sizes_px = check_recording(session)
+    sizes_px = recorded_sizes(session)
     names = [camera.name for camera in session.cameras]
     with (
         closing(segmented_frames(session, frames)) as cut,

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import SceneError, SessionError
+from hybridve.calib.errors import SceneError, SessionError, ask_all
 from hybridve.hull.about import about_rig, local_origin_m, resolved_settings
 from hybridve.hull.agreement.frame import judge_frame
 from hybridve.hull.agreement.outlines import FrameOutlines
-from hybridve.hull.cad.scene import load_scene
-from hybridve.hull.capture.session import load_session
+from hybridve.hull.cad.scene import Scene, load_scene
+from hybridve.hull.capture.inspection import opened_session
 from hybridve.hull.chain import (
     Chain,
     EvaluateSettings,
@@ -58,7 +58,7 @@ from hybridve.hull.report.simulation_data import (
     Variable,
 )
 from hybridve.hull.report.simulation_file import SimulationWriter
-from hybridve.hull.report.write import refuse_existing
+from hybridve.hull.report.write import refuse_result
 from hybridve.hull.trust import Witness, judge_cameras
 from hybridve.hull.watcher import Watcher
 
@@ -106,14 +106,12 @@ def simulate_one(
         If recording, rig and scene do not fit together, the scene names no effect, or the file
         cannot be written.
     """
-    refuse_existing(output, overwrite=settings.overwrite)
-    loaded = load_scene(scene)
-    if not loaded.effects:
-        raise SceneError(
-            f"{scene}: names no effect, so there is nothing to simulate; add an [[effect]] table"
-        )
-    read_entries(loaded)  # what is wrong with the scene is said before the recording is read
-    chain = make_chain(load_session(session), loaded, settings.evaluation, watcher.stage)
+    _, loaded, opened = ask_all(
+        lambda: refuse_result(output, resume=settings.resume, overwrite=settings.overwrite),
+        lambda: _scene_with_effects(scene),
+        lambda: opened_session(session, settings.evaluation.drop_cameras),
+    )
+    chain = make_chain(opened, loaded, settings.evaluation, watcher.stage)
     with open_engine(settings.engine) as engine:
         simulation = Simulation.of(chain, engine, settings)
         header = simulation.header(settings, engine)
@@ -135,8 +133,26 @@ def simulate_one(
             seen = writer.outlines(simulation.state)
             is_still = not chain.tracks
             writer.finish(
-                judge_cameras(chain.session, chain.views, seen, chain.room, is_still=is_still)
+                judge_cameras(
+                    chain.session,
+                    chain.views,
+                    seen,
+                    chain.room,
+                    lenses=chain.undistortions,
+                    is_still=is_still,
+                )
             )
+
+
+def _scene_with_effects(path: Path) -> Scene:
+    """Return a scene with effects, all of which can be read."""
+    scene = load_scene(path)
+    if not scene.effects:
+        raise SceneError(
+            f"{path}: names no effect, so there is nothing to simulate; add an [[effect]] table"
+        )
+    read_entries(scene)
+    return scene
 
 
 @dataclass(slots=True, eq=False)

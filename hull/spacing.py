@@ -10,14 +10,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import SceneError, SessionError
+from hybridve.calib.errors import SceneError, SessionError, ask_all
 from hybridve.hull.about import resolved_settings
 from hybridve.hull.agreement.frame import judge_frame
 from hybridve.hull.agreement.outlines import FrameOutlines
 from hybridve.hull.agreement.record import SessionAgreement
 from hybridve.hull.cad.motion import Motion
 from hybridve.hull.cad.scene import Scene, SceneObject, load_scene
-from hybridve.hull.capture.session import load_session
+from hybridve.hull.capture.inspection import opened_sessions
 from hybridve.hull.chain import (
     Chain,
     EvaluateSettings,
@@ -236,11 +236,12 @@ def find_spacing(
         If recordings, rig and scene do not fit together, or no frame can be evaluated.
     """
     shifts_m = shifts_of(asked.move, asked.step_m)
-    scene = load_scene(scene_path)
-    layout = Layout.of(scene, asked.moved, asked.move, asked.clearance_m)
+    (scene, layout), opened = ask_all(
+        lambda: _laid_out(scene_path, asked),
+        lambda: opened_sessions(sessions, asked.evaluation.drop_cameras),
+    )
     chains = {
-        name: make_chain(load_session(path), scene, asked.evaluation)
-        for name, path in sessions.items()
+        name: make_chain(session, scene, asked.evaluation) for name, session in opened.items()
     }
     found = []
     for name, chain in chains.items():
@@ -274,6 +275,12 @@ def find_spacing(
         },
         sessions=tuple(found),
     )
+
+
+def _laid_out(path: Path, asked: SpacingRequest) -> tuple[Scene, Layout]:
+    """Return a scene, and its layout of which some objects are moved."""
+    scene = load_scene(path)
+    return scene, Layout.of(scene, asked.moved, asked.move, asked.clearance_m)
 
 
 def replay(
@@ -337,7 +344,14 @@ def replay(
                     doubts = doubter.frame(hull, chain.tracks.at(frame.index))
                 tally.look(frame.index, frame.time_s, hull, doubts)
             advance()
-    trust = judge_cameras(chain.session, chain.views, seen, chain.room, is_still=is_still)
+    trust = judge_cameras(
+        chain.session,
+        chain.views,
+        seen,
+        chain.room,
+        lenses=chain.undistortions,
+        is_still=is_still,
+    )
     if not tally.n_valid:
         why = f": {trust.distrust}" if trust.distrust else ""
         raise SessionError(

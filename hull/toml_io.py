@@ -41,20 +41,30 @@ def read_toml(
     try:
         text = path.read_bytes()
     except FileNotFoundError:
-        raise error_class(f"{path}: there is no such {what}") from None
+        raise error_class(
+            f"{path}: there is no such {what}; name a {what}.toml, or begin one with "
+            "`hybridve init`"
+        ) from None
     except OSError as error:
         raise error_class(f"{path}: cannot be read: {error.strerror}") from error
     try:
-        return tomllib.loads(_decoded(text)), text
+        table = tomllib.loads(_decoded(text))
     except UnicodeDecodeError as error:
         raise error_class(
             f"{path}: is not UTF-8 at byte {error.start}; save it as UTF-8"
         ) from error
     except tomllib.TOMLDecodeError as error:
         hint = ""
-        if re.search(r"escape|'\\\\'", str(error)):
+        if re.search(r"escape|hex value|'\\\\'", str(error)):
             hint = "; write folders with /, or the path in 'single quotes'"
         raise error_class(f"{path}: not valid TOML: {error}{hint}") from error
+    found = table.get("format")
+    if isinstance(found, str) and found.startswith("hybridve-") and found != f"hybridve-{what}":
+        raise error_class(
+            f"{path}: is a {found.removeprefix('hybridve-')} (format = {found!r}), expected a "
+            f"{what}; were two files exchanged?"
+        )
+    return table, text
 
 
 def _decoded(text: bytes) -> str:
@@ -113,7 +123,7 @@ _MOST_PROBLEMS = 4
 
 def like(key: str, known: Sequence[str]) -> str:
     """Return, for a message, the key that another is most like, or those that there are."""
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.7)
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.65)
     if close:
         return f"; did you mean {close[0]}?"
     return f"; there are {', '.join(known)}" if known else "; look for a spelling mistake"

@@ -6,7 +6,7 @@
     room of the empty scene -----------+-> SessionAgreement
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.lens import Undistortion
 from hybridve.calib.rig import Rig
+from hybridve.hull.agreement.blank import blank_cameras, blank_message, blank_short
 from hybridve.hull.agreement.causes import GROSS_BUMP_PX
 from hybridve.hull.agreement.frame import (
     DEFAULT_ERROR_PX,
@@ -92,7 +93,9 @@ class Witness:
         )
         deniers = np.isin(names, found.deniers)
         alone_px = found.alone_px(names)
-        return found, FrameOutlines(index, outlines, deniers, found.supported_share, alone_px)
+        return found, FrameOutlines(
+            index, outlines, deniers, found.supported_share, alone_px, hull.object_shares()
+        )
 
 
 def judge_cameras(
@@ -101,11 +104,13 @@ def judge_cameras(
     frames: Sequence[FrameOutlines],
     room: RoomCheck,
     *,
+    lenses: Sequence[Undistortion],
     is_still: bool,
 ) -> SessionAgreement:
     """Return what the cameras of a session say about each other, and what the empty room does.
 
-    Of cameras that move only the empty room is asked.
+    Besides, cameras that show one and the same in all frames. Of cameras that move nothing else is
+    asked, but of the empty room.
 
     Parameters
     ----------
@@ -117,6 +122,8 @@ def judge_cameras(
         Of all frames, those that were not read among them.
     room : RoomCheck
         What the empty scene shows of the room in which they were calibrated.
+    lenses : sequence of Undistortion
+        How their images became pinhole images.
     is_still : bool
         Whether no camera moves.
     """
@@ -145,7 +152,64 @@ def judge_cameras(
         )
         for name, message in zip(room.moved, room.messages, strict=True)
     )
-    return replace(found, causes=(*moved, *found.causes)) if moved else found
+    read = [frame for frame in frames if frame.outlines]
+    if not read:
+        return replace(found, causes=(*moved, *found.causes))
+    recorded = [1.0 if lens.seen is None else float(lens.seen.mean()) for lens in lenses]
+    shares = np.array([frame.object_share for frame in read]) / recorded
+    # Of one area, with the same corners: the same, but for what is no larger than noise.
+    is_same = [
+        np.ptp(shares[:, camera]) == 0.0
+        and all(frame.outlines[camera].is_same(read[0].outlines[camera]) for frame in read)
+        for camera in range(len(lenses))
+    ]
+    explained = {name for cause in found.causes if cause.is_gross for name in cause.cameras}
+    blank = blank_causes(
+        session, shares, np.array(is_same), (read[0].index, read[-1].index), explained
+    )
+    return replace(found, causes=(*moved, *found.causes, *blank))
+
+
+def blank_causes(
+    session: Session,
+    shares: NDArray[np.float64],
+    is_same: NDArray[np.bool_],
+    frames: tuple[int, int],
+    explained: Collection[str] = (),
+) -> tuple[NamedCause, ...]:
+    """Return what there is to say of cameras that show one and the same in all frames.
+
+    Parameters
+    ----------
+    session : Session
+        Whose C cameras.
+    shares, is_same
+        As of `hybridve.hull.agreement.blank.blank_cameras`.
+    frames : (first, last)
+        Numbers of the frames.
+    explained : collection of str
+        Cameras of which it is known already why they are all object, as of inverted masks.
+    """
+    names = [camera.name for camera in session.cameras]
+    causes = []
+    for one in blank_cameras(shares, is_same):
+        cameras = tuple(names[camera] for camera in one.cameras)
+        if one.kind == "all object" and set(cameras) <= set(explained):
+            continue
+        has_masks = session.cameras[one.cameras[0]].has_masks
+        causes.append(
+            NamedCause(
+                kind=one.kind,
+                cameras=cameras,
+                first_frame=frames[0],
+                last_frame=frames[1],
+                is_gross=False,
+                short=blank_short(one, names),
+                message=blank_message(one, names, has_masks=has_masks),
+                size=float(one.n_frames),
+            )
+        )
+    return tuple(causes)
 
 
 def _with_rooms(
@@ -239,5 +303,10 @@ class Desk:
     def judge(self) -> SessionAgreement:
         """Return what the cameras say about each other in all frames that were taken."""
         return judge_cameras(
-            self.session, self.views, self.frames, self.room, is_still=not self.tracks
+            self.session,
+            self.views,
+            self.frames,
+            self.room,
+            lenses=self.lenses,
+            is_still=not self.tracks,
         )

@@ -330,6 +330,7 @@ def judged(frames: Sequence[Masks], first: int = 0, step: int = 1) -> SessionAgr
             nobody,
             nothing,
             np.full((4, 4), np.nan),
+            np.array([mask.mean() for mask in masks]),
         )
         for row, masks in enumerate(frames)
     ]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from hybridve.calib.orientation import exif_orientation, said_orientation
+from hybridve.calib.orientation import exif_orientation, picture_size, said_orientation
 
 ORIENTATION = 0x0112
 
@@ -52,3 +52,27 @@ def test_a_damaged_file_says_nothing(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
 
     assert exif_orientation(path) == 1
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png"])
+@pytest.mark.parametrize("is_progressive", [False, True])
+def test_the_size_of_a_still_is_read_from_its_header(
+    tmp_path: Path, ending: str, is_progressive: bool
+) -> None:
+    path = tmp_path / f"still.{ending}"
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6
+    exif[0x010E] = "x" * 60_000  # a block as long as that of a telephone with its thumbnail
+    Image.new("RGB", (321, 123)).save(path, exif=exif, progressive=is_progressive)
+
+    assert picture_size(path) == (321, 123)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xd8", b"\xff\xd8\xff\xc0\x00", b"\x89PNG\r\n\x1a\n", b"BM"]
+)
+def test_a_damaged_file_says_no_size(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "still.jpg"
+    path.write_bytes(content)
+
+    assert picture_size(path) is None

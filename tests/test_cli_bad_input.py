@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 from helpers.sessions import SESSION_HEAD, write_ball_session, write_cube_scene
+from PIL import Image
 
 Run = Callable[..., int]
 
+ORIENTATION = 0x0112
 RIG = 'rig = "rig.csv"\nrig_unit = "m"\n'
 TARGET = '[target]\nkind = "chessboard"\ncolumns = 8\nrows = 6\nsquare_mm = 30\n'
 
@@ -61,6 +63,146 @@ def expect_one_line(
 def detect_arguments(folder: Path) -> list[object]:
     output = folder / "report.h5"
     return ["detect", folder, "--scene", folder / "scene.toml", "-o", output, "--no-progress"]
+
+
+#: Commands that work long, each with what it needs besides the session; "OUT" is its output.
+LONG: dict[str, tuple[object, ...]] = {
+    "calibrate": ("-o", "OUT"),
+    "detect": ("--scene", "SCENE", "-o", "OUT"),
+    "segment": (),
+    "simulate": ("--scene", "SCENE", "-o", "OUT"),
+    "spacing": (*("--scene", "SCENE", "--move", "cube", "--along", "0,0,1"), "--range-mm", "0:9"),
+    "sweep": ("--scene", "SCENE", "-o", "OUT"),
+}
+
+
+def long_arguments(command: str, folder: Path) -> list[object]:
+    paths = {"SCENE": folder / "scene.toml", "OUT": folder / "out.h5"}
+    return [command, folder, *(paths.get(str(word), word) for word in LONG[command])]
+
+
+def told(run: Run, capsys: pytest.CaptureFixture[str], *arguments: object) -> list[str]:
+    assert run(*arguments, "--no-progress") == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    return shown.err.splitlines()
+
+
+@pytest.mark.parametrize("command", LONG)
+def test_all_that_is_wrong_with_the_files_is_told_in_one_go_before_any_work(
+    run: Run, capsys: pytest.CaptureFixture[str], films: Path, command: str
+) -> None:
+    write_video(films / "left" / "board.avi", (64, 48), 0)
+    write_video(films / "right" / "background.avi", (48, 64), 3)
+    scene = films / "scene.toml"
+    scene.write_text(scene.read_text(encoding="utf-8").replace('unit = "mm"', 'unit = "mile"'))
+    before = sorted(films.rglob("*"))
+
+    lines = told(run, capsys, *long_arguments(command, films))
+
+    wanted = [
+        "camera.1.intrinsics: left/board.avi: no frame can be read",
+        "camera.1.extrinsics: left/board.avi: no frame can be read",
+        "camera.2.background: 'right/background.avi' is 48x64, but 'right/video.avi' is 64x48; one "
+        "was turned when it was saved; give all as the camera wrote them",
+    ]
+    if "SCENE" in LONG[command]:
+        wanted.append("scene.toml: object.1.unit: ")
+    for text in wanted:
+        assert sum(text in line for line in lines) == 1, (text, lines)
+    assert len(lines) == len(wanted), lines
+    assert all(line.startswith("error: ") for line in lines)
+    assert sorted(films.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", LONG)
+def test_all_files_that_are_missing_are_told_in_one_go(
+    run: Run, capsys: pytest.CaptureFixture[str], films: Path, command: str
+) -> None:
+    (films / "left" / "video.avi").unlink()
+    (films / "right" / "board.avi").unlink()
+    before = sorted(films.rglob("*"))
+    arguments = long_arguments(command, films)
+
+    lines = told(run, capsys, *arguments)
+
+    if command == "simulate":  # the scene names no effect, and that is told besides
+        assert "names no effect" in lines.pop(0)
+    assert [line.split(": ")[2] for line in lines] == [
+        "camera.1.video",
+        "camera.2.intrinsics",
+        "camera.2.extrinsics",
+    ]
+    assert sorted(films.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", ["detect", "simulate"])
+def test_a_run_that_was_cut_off_is_told_before_any_work(
+    run: Run, capsys: pytest.CaptureFixture[str], films: Path, command: str
+) -> None:
+    (films / "out.h5.parts").mkdir()
+    (films / "rig.csv").unlink()  # what would be found later
+
+    lines = told(run, capsys, *long_arguments(command, films))
+
+    assert any(
+        "a run that was cut off stands there; take it up with --resume" in one for one in lines
+    )
+    assert not any("rig.csv" in line for line in lines)
+
+
+def test_frames_that_no_camera_has_are_told_before_any_work(
+    run: Run, capsys: pytest.CaptureFixture[str], films: Path
+) -> None:
+    message = "has none of the frames 100:200:1: it has 6, the first of which is 0"
+
+    expect_one_line(run, capsys, message, *detect_arguments(films), "--frames", "100:200")
+
+    assert not (films / "report.h5").exists()
+
+
+def still(path: Path, size_px: tuple[int, int], orientation: int = 1) -> None:
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    Image.new("RGB", size_px, (90, 90, 90)).save(path, exif=exif)
+
+
+def with_stills(films: Path) -> None:
+    session = films / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    session.write_text(text.replace('"left/board.avi"', '"left/still*.jpg"'), encoding="utf-8")
+
+
+def test_tags_that_differ_are_a_warning_and_the_pixels_stay(
+    run: Run, capsys: pytest.CaptureFixture[str], films: Path
+) -> None:
+    with_stills(films)
+    for number, orientation in enumerate((1, 6, 1)):
+        still(films / "left" / f"still{number}.jpg", (64, 48), orientation)
+
+    assert run(*detect_arguments(films)) == 0
+
+    warned = [line for line in capsys.readouterr().err.splitlines() if "say that they are" in line]
+    assert len(warned) == 2, warned  # of intrinsics and of extrinsics, which are the same stills
+    assert "camera.1.intrinsics: the pictures of 'left/still*.jpg' say that they are" in warned[0]
+    assert "turned by 90 degrees, upright" in warned[0]
+
+
+def test_stills_of_which_some_were_turned_when_they_were_saved_are_refused(
+    run: Run, capsys: pytest.CaptureFixture[str], films: Path
+) -> None:
+    with_stills(films)
+    for number, size_px in enumerate(((64, 48), (48, 64), (64, 48))):
+        still(films / "left" / f"still{number}.jpg", size_px)
+
+    lines = told(run, capsys, *long_arguments("calibrate", films))
+
+    text = (
+        "camera.1.intrinsics: 'left/still*.jpg': 'still1.jpg' is 48x64, the first picture 64x48: "
+        "some were turned when they were saved; give all as the camera wrote them"
+    )
+    assert sum(text in line for line in lines) == 1
+    assert len(lines) == 2
 
 
 def test_the_session_of_these_tests_is_good(run: Run, films: Path) -> None:

@@ -93,7 +93,7 @@ NOTES: list[tuple[str, Callable[[Path], object], str]] = [
     (
         "empty",
         lambda folder: spoil(folder, "cam1", lambda mask: np.zeros_like(mask)),
-        "camera 'cam1' is empty in all 9 frames looked at",
+        "cam1 saw nothing in all 9 frames looked at, and all that is kept or free rests on that",
     ),
     (
         "the same",
@@ -102,7 +102,7 @@ NOTES: list[tuple[str, Callable[[Path], object], str]] = [
             for frame in range(9)
             if frame != 4
         ],
-        "camera 'cam1' shows the very same silhouette in all 9 frames looked at",
+        "cam1 shows the very same silhouette in all 9 frames looked at; is one picture there",
     ),
     (
         "a gap",

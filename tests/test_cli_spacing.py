@@ -151,7 +151,7 @@ def test_no_shift_that_serves_is_a_result(
         (["--move", "part"], "object 'part' is to move twice"),
         (["--clearance-mm", "-1"], "--clearance-mm -1: expected 0 or more"),
         (["--along", "0,0,0"], "points nowhere"),
-        (["--frames", "90:95"], "none of the frames 90:95:1 can be evaluated"),
+        (["--frames", "90:95"], "none of the frames 90:95:1: it has 3"),
         (["--step-mm", "0.0001"], "take longer steps"),
     ],
 )

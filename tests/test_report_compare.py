@@ -79,6 +79,7 @@ def a_summary(verdict: str, lower_m: float | None, name: str = "payload") -> dic
     }
     trusted = verdict != "unknown"
     about = {"report": "r.h5", "trusted": trusted, "frames": 10, "frames_invalid": 1}
+    about["kept_rests_on"] = "cam1 having seen nothing in all 9 frames" if lower_m else ""
     return {**about, "objects": [found]}
 
 
@@ -116,6 +117,9 @@ def test_the_table_has_units_and_kinds_and_leaves_unknown_cells_empty(tmp_path: 
     assert rows["wide", "frames_below_required"]["p2"] == "4"
     assert rows["narrow", "verdict"]["p1"] == "colliding"
     assert (rows["wide", "trusted"]["p1"], rows["wide", "trusted"]["p2"]) == ("yes", "no")
+    rests_on = rows["wide", "kept_rests_on"]
+    assert rests_on["p1"] == "cam1 having seen nothing in all 9 frames"
+    assert rests_on["p2"] == ""
     assert list(tmp_path.iterdir()) == [path]
 
 

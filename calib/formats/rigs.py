@@ -14,6 +14,7 @@ import numpy as np
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.files import nearly
 from hybridve.calib.formats import caliscope, kalibr, multical, opencv, rows
 from hybridve.calib.formats.colmap import read_colmap_model
 from hybridve.calib.formats.foreign import (
@@ -134,7 +135,8 @@ def read_any_rig(
         size_px = _foreign(found, name, pattern).size_px or image_size
         if size_px is None:
             raise CalibrationError(
-                f"{pattern}: does not say the image size of camera {name!r}; give it"
+                f"{pattern}: does not say the image size of camera {name!r}; give it, "
+                "width x height in pixels"
             )
         sizes[name] = size_px
     return _to_rig(found, pattern, unit, factor_m, pixel_centre, sizes)
@@ -309,7 +311,7 @@ def _read(root: Path, pattern: str, names: list[str]) -> ForeignRig | Rig:
     if path.is_dir():
         return _read_colmap_folder(path)
     if not path.is_file():
-        raise CalibrationError(f"{path}: there is no such rig file")
+        raise CalibrationError(f"{path}: there is no such rig file{nearly(path)}")
     return _read_file(path, names)
 
 

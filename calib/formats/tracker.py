@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.files import nearly
 from hybridve.calib.pose import Pose, nearest_rotation
 
 #: A quaternion's length, and a matrix's R R^T, may be this far from 1: rounded, not damaged.
@@ -111,7 +112,7 @@ def _read_table(path: Path, what: str) -> tuple[list[str], list[_Row]]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except FileNotFoundError:
-        raise CalibrationError(f"{path}: there is no such file of {what}") from None
+        raise CalibrationError(f"{path}: there is no such file of {what}{nearly(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{path}: cannot be read: {error}") from error
     rows = [

@@ -48,6 +48,14 @@ class Outline:
         """Return that of a camera that saw nothing, or nothing but object."""
         return cls(np.zeros((0, 2), np.float32), np.zeros(0, np.uint8), is_inverse)
 
+    def is_same(self, other: "Outline") -> bool:
+        """Tell whether another outline has the very same corners."""
+        return (
+            self.is_inverse == other.is_inverse
+            and np.array_equal(self.corners_px, other.corners_px)
+            and np.array_equal(self.marks, other.marks)
+        )
+
 
 def outline_of(mask: NDArray[np.uint8], inner: NDArray[np.uint8] | None = None) -> Outline:
     """Return the outline of a silhouette.
@@ -115,6 +123,8 @@ class FrameOutlines:
     alone_px : (C, 4) float64
         Left, top, right and bottom of what each camera sees alone, that all others deny; NaN
         where there is no such piece.
+    object_share : (C,) float64
+        Which share of each undistorted picture is object; NaN where the frame was not read.
     is_contradictory : bool
         Whether no point is in all silhouettes, by more than they err.
     """
@@ -124,6 +134,7 @@ class FrameOutlines:
     deniers: NDArray[np.bool_]
     supported_share: NDArray[np.float64]
     alone_px: NDArray[np.float64]
+    object_share: NDArray[np.float64]
     is_contradictory: bool = False
 
     @classmethod
@@ -131,7 +142,7 @@ class FrameOutlines:
         """Return what is kept of a frame that could not be read."""
         nothing = np.full(n_cameras, np.nan)
         nowhere = np.full((n_cameras, 4), np.nan)
-        return cls(index, (), np.zeros(n_cameras, np.bool_), nothing, nowhere)
+        return cls(index, (), np.zeros(n_cameras, np.bool_), nothing, nowhere, nothing)
 
 
 def pack_frames(frames: Sequence[FrameOutlines]) -> dict[str, NDArray[Any]]:
@@ -149,6 +160,7 @@ def pack_frames(frames: Sequence[FrameOutlines]) -> dict[str, NDArray[Any]]:
         "deniers": np.array([frame.deniers for frame in frames]),
         "supported_share": np.array([frame.supported_share for frame in frames]),
         "alone_px": np.array([frame.alone_px for frame in frames]),
+        "object_share": np.array([frame.object_share for frame in frames]),
         "is_contradictory": np.array([frame.is_contradictory for frame in frames]),
     }
 
@@ -170,6 +182,7 @@ def unpack_frames(packed: Mapping[str, NDArray[Any]]) -> list[FrameOutlines]:
             packed["deniers"][row],
             packed["supported_share"][row],
             packed["alone_px"][row],
+            packed["object_share"][row],
             is_contradictory=bool(packed["is_contradictory"][row]),
         )
         for row, stop in enumerate(ends.tolist())

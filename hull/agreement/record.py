@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.plain import Told
+from hybridve.hull.agreement.blank import rests_on_text
 
 #: Of a picture's shift so much is taken to be in the outlines' stated error, in pixels.
 STATED_PX = 1.0
@@ -31,7 +32,8 @@ class NamedCause(Told):
     message : str
         What was found, what was expected, and what to do: one line.
     size, low, high : float or None
-        Of a delay in frames, of a bump in pixels; 95 % interval.
+        Of a delay in frames, of a bump in pixels, with a 95 % interval; of a camera that shows one
+        and the same (see `hybridve.hull.agreement.blank`) in how many frames it does.
     moved_px : (float, float) or None
         Of a bump.
     before_px, after_px : float or None
@@ -105,6 +107,13 @@ class SessionAgreement(Told):
         """Why it may not, in words; empty if it may."""
         gross = [cause.short for cause in self.causes if cause.is_gross]
         return f"the session is not to be trusted: {'; '.join(gross)}" if gross else ""
+
+    @property
+    def rests_on(self) -> str:
+        """Which cameras saw nothing at all, on which all that is free rests; in words, or empty."""
+        silent = [cause for cause in self.causes if cause.kind == "saw nothing"]
+        names = [name for cause in silent for name in cause.cameras]
+        return rests_on_text(names, round(silent[0].size or 0)) if silent else ""
 
     def wrong(self, index: NDArray[np.int64]) -> list[str]:
         """Return of each frame number (F,) why that frame is not to be believed; else empty."""

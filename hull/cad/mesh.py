@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
+from hybridve.calib.files import nearly
 from hybridve.hull.cad.mesh_cache import find_meshes, keep_meshes, mesh_key
 from hybridve.hull.cad.part import Contents, Part, Up, join_parts
 from hybridve.hull.cad.polygons import Cuts
@@ -71,7 +72,7 @@ def kind_of(path: Path) -> str:
         If there is no such file, or its kind is unknown.
     """
     if not path.is_file():
-        raise SceneError(f"there is no mesh file {path}")
+        raise SceneError(f"there is no mesh file {path}{nearly(path)}")
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         kinds = ", ".join(FORMATS)

@@ -1,24 +1,31 @@
 """What the files of a session are, camera by camera, told without reading a recording to its end.
 
-Every file is looked at: that it is there, not empty, and begins as a picture does. Of pictures the
-first is read, of videos the first frame, the header and, of an AVI, the index.
+A `glance` takes a moment: of all pictures and clips that a camera names the first one is read, some
+are asked for their size and their tags, and all are compared. Every command that works long begins
+with it, and tells all that is wrong in one go (`opened_session`). `inspect_camera` looks at every
+file besides: that it is not empty, and begins as a picture does; of videos at the header and, of an
+AVI, at the index.
 """
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from hybridve.calib.avi_index import avi_frames
-from hybridve.calib.errors import SessionError
-from hybridve.calib.image_io import FrameSource, open_source
-from hybridve.calib.orientation import said_orientation
+from hybridve.calib.errors import Faults, SessionError
+from hybridve.calib.image_io import FrameSource
+from hybridve.calib.orientation import picture_size, said_orientation
 from hybridve.calib.plain import Told
-from hybridve.hull.capture.recording import mask_reading
-from hybridve.hull.capture.session import Session, SessionCamera
-from hybridve.hull.toml_io import expand_root, read_toml
+from hybridve.hull.capture.recording import HEADER_SLACK, mask_reading
+from hybridve.hull.capture.session import Session, SessionCamera, load_session
+
+_log = logging.getLogger(__name__)
 
 #: The keys of a camera that name pictures or clips, in the order of the work; and the recording's.
 SOURCES = ("intrinsics", "extrinsics", "background", "video", "masks")
@@ -32,9 +39,6 @@ _MOST_TAGS = 40
 
 #: Two sizes are of one shape if their ratios differ by less than this.
 _SAME_SHAPE = 0.005
-
-#: How many frames a header may be off without a word: containers count what codecs hold back.
-HEADER_SLACK = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,41 +119,173 @@ class CameraFiles(Told):
         return next((one for one in self.sources if one.key == key), None)
 
 
-def missing_files(path: Path) -> list[str]:
-    """Return a line for every file that a session.toml names and that cannot be opened.
+def opened_session(path: Path, without: Collection[str] = ()) -> Session:
+    """Return a session, glanced at: what would fail later is told before any work, all in one go.
 
-    It is for a session that cannot be loaded: the first of its faults is told there, and all files
-    here. Empty where something else is the matter with it.
+    What is odd about its tags is logged as a warning.
+
+    Parameters
+    ----------
+    path : Path
+        A session.toml, or its folder.
+    without : collection of str
+        Cameras that will not be used, by name.
+
+    Raises
+    ------
+    SessionError
+        A line for each thing that is wrong.
     """
-    if path.is_dir():
-        path = path / "session.toml"
-    table, _ = read_toml(path, "session", SessionError)
-    cameras = table.get("camera")
-    if not isinstance(cameras, list) or not isinstance(table.get("root", "."), str):
-        return []
-    root = expand_root(table.get("root", "."), path, SessionError)
-    lines = []
-    for number, camera in enumerate(cameras, start=1):
-        for key in SOURCES if isinstance(camera, dict) else ():
-            if not isinstance(camera.get(key), str):
-                continue
-            try:
-                open_source(root, camera[key])
-            except SessionError as error:
-                lines.append(f"{path}: camera.{number}.{key}: {error}")
-    return lines
+    session = load_session(path)
+    numbers = [
+        number for number, camera in enumerate(session.cameras) if camera.name not in without
+    ]
+    with ThreadPoolExecutor(max_workers=max(1, len(numbers))) as pool:
+        found = list(pool.map(lambda number: glance(session, number), numbers))
+    if problems := [line for one in found for line in one.problems]:
+        raise SessionError(*problems)
+    for one in found:
+        for line in one.tag_notes:
+            _log.warning("%s", line)
+    return session
+
+
+def opened_sessions(paths: Mapping[str, Path], without: Collection[str] = ()) -> dict[str, Session]:
+    """Return several sessions, by name, each as `opened_session` gives it.
+
+    Raises
+    ------
+    SessionError
+        A line for each thing that is wrong with any of them.
+    """
+    faults = Faults()
+    opened = {}
+    for name, path in paths.items():
+        session = faults.of(partial(opened_session, path, without))
+        if session is not None:
+            opened[name] = session
+    faults.refuse()
+    return opened
+
+
+@dataclass(frozen=True, slots=True)
+class GlancedSource:
+    """What a moment's look at one key of a camera tells.
+
+    Attributes
+    ----------
+    key : str
+        One of `SOURCES`.
+    source : FrameSource
+        What it names.
+    width_px, height_px, channels, bits : int
+        Of the first picture; 0 by 0 if it cannot be read.
+    orientation : str
+        How its files want to be turned; "mixed" where they differ, "" where they say nothing.
+    """
+
+    key: str
+    source: FrameSource
+    width_px: int
+    height_px: int
+    channels: int
+    bits: int
+    orientation: str
+
+    @property
+    def size(self) -> str:
+        """Its size in words."""
+        return f"{self.width_px}x{self.height_px}"
+
+    def is_turned_from(self, other: "GlancedSource") -> bool:
+        """Tell whether it is as wide as the other is high, and as high as that is wide."""
+        return (self.width_px, self.height_px) == (other.height_px, other.width_px)
+
+
+@dataclass(frozen=True, slots=True)
+class GlancedCamera:
+    """What a moment's look at one camera's files tells.
+
+    Attributes
+    ----------
+    sources : tuple of GlancedSource
+        A look at each of its keys.
+    problems, notes, tag_notes : tuple of str
+        What makes a run impossible, what else is worth a look, and what is odd about tags that say
+        how to turn a picture; a line each.
+    """
+
+    sources: tuple[GlancedSource, ...]
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+    tag_notes: tuple[str, ...]
+
+
+def glance(session: Session, number: int) -> GlancedCamera:
+    """Return what a moment's look tells of a camera's files, by its place in the session."""
+    camera = session.cameras[number]
+    where = f"{session.path}: camera.{number + 1}"
+    problems: list[str] = []
+    notes: list[str] = []
+    tag_notes: list[str] = []
+    sources = tuple(
+        _glance(source, key, f"{where}.{key}", problems, tag_notes)
+        for key, source in _sources_of(camera).items()
+        if source is not None
+    )
+    _compare_sizes(sources, where, problems, notes)
+    _compare_orientations(sources, where, tag_notes)
+    return GlancedCamera(sources, tuple(problems), tuple(notes), tuple(tag_notes))
+
+
+def _glance(
+    source: FrameSource, key: str, where: str, problems: list[str], tag_notes: list[str]
+) -> GlancedSource:
+    height_px = width_px = channels = 0
+    bits = 8
+    try:
+        # As it is stored: what is read to 8 bits and 3 colours no longer tells.
+        first = source if source.is_video else FrameSource(source.label, source.paths, False, True)
+        image = first.first()
+        height_px, width_px = image.shape[:2]
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        bits = 16 if image.dtype == np.uint16 else 8
+    except SessionError as error:
+        problems.append(f"{where}: {error}; copy it again, or take out what is none")
+    some = source.paths[:: -(-len(source.paths) // _MOST_TAGS)]
+    if not source.is_video:
+        sizes = {path: picture_size(path) for path in some}
+        turned = [path for path, size in sizes.items() if size == (height_px, width_px)]
+        if turned and height_px != width_px:
+            problems.append(
+                f"{where}: {source.label!r}: {turned[0].name!r} is {height_px}x{width_px}, the "
+                f"first picture {width_px}x{height_px}: some were turned when they were saved; "
+                f"{_AS_RECORDED}"
+            )
+    marks = {said_orientation(path, is_video=source.is_video) for path in some}
+    if len(marks) > 1:
+        told = ", ".join(sorted(mark or "upright" for mark in marks))
+        tag_notes.append(
+            f"{where}: the pictures of {source.label!r} say that they are {told}; they are read "
+            "as the sensor has them, so the camera must not have been turned between them"
+        )
+    orientation = "mixed" if len(marks) > 1 else next(iter(marks))
+    return GlancedSource(key, source, width_px, height_px, channels, bits, orientation)
+
+
+#: What to do about pictures that were turned by a program.
+_AS_RECORDED = "give all as the camera wrote them"
 
 
 def inspect_camera(session: Session, number: int) -> CameraFiles:
     """Return what the files of a session's camera are, by its place in the session."""
     camera = session.cameras[number]
     where = f"{session.path}: camera.{number + 1}"
-    problems: list[str] = []
-    notes: list[str] = []
+    looked = glance(session, number)
+    problems: list[str] = list(looked.problems)
+    notes: list[str] = list(looked.notes)
     sources = [
-        _inspect(session, source, key, f"{where}.{key}", problems, notes)
-        for key, source in _sources_of(camera).items()
-        if source is not None
+        _inspect(session, one, f"{where}.{one.key}", problems, notes) for one in looked.sources
     ]
     masks = ""
     if camera.has_masks and camera.recording is not None:
@@ -158,9 +294,7 @@ def inspect_camera(session: Session, number: int) -> CameraFiles:
             masks = f"{reading.channel} above {reading.above} of {reading.most}"
         except SessionError as error:
             problems.append(str(error))
-    found = CameraFiles(camera.name, tuple(sources), masks, (), ())
-    _compare_sizes(found, where, problems, notes)
-    _compare_orientations(found, where, notes)
+    notes += looked.tag_notes
     return CameraFiles(camera.name, tuple(sources), masks, tuple(problems), tuple(notes))
 
 
@@ -174,31 +308,15 @@ def _sources_of(camera: SessionCamera) -> dict[str, FrameSource | None]:
 
 
 def _inspect(
-    session: Session,
-    source: FrameSource,
-    key: str,
-    where: str,
-    problems: list[str],
-    notes: list[str],
+    session: Session, looked: GlancedSource, where: str, problems: list[str], notes: list[str]
 ) -> SourceCheck:
+    source, key = looked.source, looked.key
     unreadable = [path for path in source.paths if not _begins_well(path, source.is_video)]
-    if unreadable:
+    if unreadable and looked.width_px:  # else the first is told already
         problems.append(
             f"{where}: {_named(unreadable, len(source.paths))} cannot be read: empty, or no "
             f"{'video' if source.is_video else 'picture'}; copy again, or take out what is none"
         )
-    height_px = width_px = channels = 0
-    bits = 8
-    try:
-        # As it is stored: what is read to 8 bits and 3 colours no longer tells.
-        first = source if source.is_video else FrameSource(source.label, source.paths, False, True)
-        image = first.first()
-        height_px, width_px = image.shape[:2]
-        channels = 1 if image.ndim == 2 else image.shape[2]
-        bits = 16 if image.dtype == np.uint16 else 8
-    except SessionError as error:
-        if not unreadable:
-            problems.append(f"{where}: {error}")
     # A recording's frames are numbered with those that nobody has.
     is_counted = source.is_video or key in RECORDINGS
     n_frames = source.claimed_length() if is_counted else len(source.paths)
@@ -215,28 +333,20 @@ def _inspect(
             f"{where}: {source.label!r} lacks {n_missing} of the instants of which other cameras "
             "have pictures; the others stay in their places"
         )
-    some = source.paths[:: -(-len(source.paths) // _MOST_TAGS)]
-    marks = {said_orientation(path, is_video=source.is_video) for path in some}
-    if len(marks) > 1:
-        told = ", ".join(sorted(mark or "upright" for mark in marks))
-        notes.append(
-            f"{where}: the pictures of {source.label!r} say that they are {told}; they are read "
-            "as the sensor has them, so the camera must not have been turned between them"
-        )
     return SourceCheck(
         key,
         source.label,
         source.is_video,
-        width_px,
-        height_px,
-        bits,
-        channels,
+        looked.width_px,
+        looked.height_px,
+        looked.bits,
+        looked.channels,
         n_frames,
         n_missing,
         n_lost,
         n_damaged,
         source.rate(),
-        "mixed" if len(marks) > 1 else next(iter(marks)),
+        looked.orientation,
     )
 
 
@@ -264,40 +374,48 @@ def _n_lacking(session: Session, key: str, source: FrameSource) -> int:
     )
 
 
-def _compare_sizes(found: CameraFiles, where: str, problems: list[str], notes: list[str]) -> None:
+def _compare_sizes(
+    sources: tuple[GlancedSource, ...], where: str, problems: list[str], notes: list[str]
+) -> None:
     """Tell which pictures of a camera are of another size than its recording, or its board clip."""
-    recording, clip = found.recording, found.source("extrinsics")
+    known = {one.key: one for one in sources if one.width_px}
+    recording = known.get("video") or known.get("masks")
     for key in ("extrinsics", "background"):
-        one = found.source(key)
-        if one is None or recording is None or not one.width_px or not recording.width_px:
+        one = known.get(key)
+        if one is None or recording is None or one.size == recording.size:
             continue
-        if (one.width_px, one.height_px) != (recording.width_px, recording.height_px):
-            problems.append(
-                f"{where}.{key}: {one.label!r} is {one.width_px}x{one.height_px}, but "
-                f"{recording.label!r} is {recording.width_px}x{recording.height_px}; record both "
-                "with the same settings"
-            )
-    stills, clip = found.source("intrinsics"), clip or recording
-    if stills is None or clip is None or not stills.width_px or not clip.width_px:
-        return
-    if (stills.width_px, stills.height_px) == (clip.width_px, clip.height_px):
+        what_to_do = "record both with the same settings"
+        if one.is_turned_from(recording):
+            what_to_do = f"one was turned when it was saved; {_AS_RECORDED}"
+        problems.append(
+            f"{where}.{key}: {one.source.label!r} is {one.size}, but {recording.source.label!r} is "
+            f"{recording.size}; {what_to_do}"
+        )
+    stills, clip = known.get("intrinsics"), known.get("extrinsics") or recording
+    if stills is None or clip is None or stills.size == clip.size:
         return
     ratio = stills.width_px * clip.height_px / (stills.height_px * clip.width_px)
     text = (
-        f"{where}.intrinsics: {stills.label!r} is {stills.width_px}x{stills.height_px}, but "
-        f"{clip.label!r} is {clip.width_px}x{clip.height_px}"
+        f"{where}.intrinsics: {stills.source.label!r} is {stills.size}, but {clip.source.label!r} "
+        f"is {clip.size}"
     )
     if abs(ratio - 1.0) < _SAME_SHAPE:
         notes.append(f"{text}; the lens is scaled, which is wrong where the clip was cut out of it")
+    elif abs(stills.width_px * clip.width_px / (stills.height_px * clip.height_px) - 1.0) < (
+        _SAME_SHAPE
+    ):
+        problems.append(f"{text}: one was turned when it was saved; {_AS_RECORDED}")
     else:
         problems.append(f"{text}, of another shape; record both in the same mode")
 
 
-def _compare_orientations(found: CameraFiles, where: str, notes: list[str]) -> None:
-    said = {one.key: one.orientation for one in found.sources if one.orientation != "mixed"}
+def _compare_orientations(
+    sources: tuple[GlancedSource, ...], where: str, tag_notes: list[str]
+) -> None:
+    said = {one.key: one.orientation for one in sources if one.orientation != "mixed"}
     if len(set(said.values())) > 1:
         told = ", ".join(f"{key} {mark or 'upright'}" for key, mark in said.items())
-        notes.append(
+        tag_notes.append(
             f"{where}: its files say to be looked at differently ({told}); all are read as the "
             "sensor has them, so the camera must not have been turned between them"
         )

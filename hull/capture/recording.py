@@ -39,6 +39,9 @@ Mask = NDArray[np.uint8]
 #: How many frames a camera is read ahead: enough to smooth out a slow frame.
 _READ_AHEAD = 3
 
+#: How many frames a header may be off without a word: containers count what codecs hold back.
+HEADER_SLACK = 5
+
 #: Ready masks that are looked at to find out what their values mean.
 _MOST_LOOKED_AT = 12
 
@@ -88,18 +91,13 @@ class FrameSilhouettes:
     segment_s: float
 
 
-def check_recording(session: Session) -> list[tuple[int, int]]:
-    """Look at what every camera recorded before long work starts.
-
-    Returns
-    -------
-    list of (width, height)
-        The size of each camera's pictures in pixels.
+def recorded_sizes(session: Session) -> list[tuple[int, int]]:
+    """Return the width and height of each camera's pictures, in pixels, by their first.
 
     Raises
     ------
     SessionError
-        If a camera recorded nothing, or its background has another size than its recording.
+        If a camera recorded nothing.
     """
     sizes_px = []
     for number, camera in enumerate(session.cameras, start=1):
@@ -109,15 +107,6 @@ def check_recording(session: Session) -> list[tuple[int, int]]:
         except SessionError as error:
             raise SessionError(f"{session.path}: camera.{number}: {error}") from error
         sizes_px.append((width, height))
-        if camera.has_masks or camera.background is None:
-            continue
-        empty_height, empty_width = camera.background.first().shape[:2]
-        if (width, height) != (empty_width, empty_height):
-            raise SessionError(
-                f"{session.path}: camera.{number}.background: {camera.background.label!r} is "
-                f"{empty_width}x{empty_height}, but {recording.label!r} is {width}x{height}; "
-                "record both with the same settings"
-            )
     return sizes_px
 
 
@@ -138,13 +127,20 @@ def check_lengths(session: Session, frames: FrameRange) -> None:
     Raises
     ------
     SessionError
-        If one camera stops before the frames that are asked for, and another does not.
+        If one camera stops before the frames that are asked for, and another does not; or all do.
     """
     recordings = [recording_of(session, camera) for camera in session.cameras]
     claimed = [recording.claimed_length() for recording in recordings]
+    shifts = [camera.shift_frames for camera in session.cameras]
+    most = max(length + shift for length, shift in zip(claimed, shifts, strict=True))
+    slack = HEADER_SLACK if any(recording.is_video for recording in recordings) else 0
+    if min(claimed) > 0 and frames.start >= most + slack:
+        raise SessionError(
+            f"{session.path}: the recording has none of the frames {frames}: it has {most}, the "
+            "first of which is 0; choose others with --frames"
+        )
     if len(set(claimed)) == 1:
         return
-    shifts = [camera.shift_frames for camera in session.cameras]
     lengths = [
         recording.count() + shift for recording, shift in zip(recordings, shifts, strict=True)
     ]

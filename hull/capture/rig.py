@@ -20,7 +20,7 @@ from hybridve.calib.judging.twins import find_twins, twins_text
 from hybridve.calib.placing.marks import Mark
 from hybridve.calib.placing.settings import CalibrationSettings
 from hybridve.calib.rig import Rig
-from hybridve.hull.capture.recording import recording_of
+from hybridve.hull.capture.recording import recorded_sizes
 from hybridve.hull.capture.rig_check import (
     camera_inputs,
     corner_cache,
@@ -107,7 +107,8 @@ def load_rig(session: Session, progress: Progress | None = None) -> Rig:
         If there is none, or it lacks a camera of the session, or is for images of another size, or
         the session's boards refute it.
     """
-    sizes_px = _recorded_sizes(session)
+    names = [camera.name for camera in session.cameras]
+    sizes_px = dict(zip(names, recorded_sizes(session), strict=True))
     if session.rig_file is not None:
         rig, label = _import(session, session.rig_file, sizes_px), session.rig_file.pattern
     else:
@@ -195,14 +196,6 @@ def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, 
     )
     # The session's cameras in the session's order; a rig may hold more.
     return rig.only([camera.name for camera in session.cameras])
-
-
-def _recorded_sizes(session: Session) -> dict[str, tuple[int, int]]:
-    sizes_px = {}
-    for camera in session.cameras:
-        height_px, width_px = recording_of(session, camera).first().shape[:2]
-        sizes_px[camera.name] = (width_px, height_px)
-    return sizes_px
 
 
 def board_sizes(session: Session) -> dict[str, tuple[int, int]]:

@@ -19,7 +19,8 @@ from pydantic import (
     ValidationError,
 )
 
-from hybridve.calib.errors import SessionError
+from hybridve.calib.errors import Faults, SessionError
+from hybridve.calib.files import nearly
 from hybridve.calib.image_io import FrameSource, in_step, open_source, significant_bits
 from hybridve.hull.capture.segment import SegmentSettings
 from hybridve.hull.capture.session_tables import (
@@ -203,7 +204,7 @@ def load_session(path: Path) -> Session:
     ------
     SessionError
         One line that names the key at fault: no such file, broken TOML, a wrong or missing key, an
-        unknown value, a camera named twice, a file that is missing or cannot be read.
+        unknown value, a camera named twice; a line for each file that is missing or cannot be read.
     """
     if path.is_dir():
         path = path / "session.toml"
@@ -230,11 +231,14 @@ def load_session(path: Path) -> Session:
         raise SessionError(
             f"{path}: min_cameras: {parsed.min_cameras} of {len(names)} cameras cannot see a point"
         )
+    faults = Faults()
+    found = [
+        _find_files(camera, number, shared_params, root, path, faults)
+        for number, camera in enumerate(parsed.camera, start=1)
+    ]
+    faults.refuse()
     cameras = _in_step(
-        tuple(
-            _find_files(camera, number, shared_params, root, path)
-            for number, camera in enumerate(parsed.camera, start=1)
-        ),
+        tuple(found),
         path,
         # A camera that began later counts from its own beginning.
         have_own_counters=any(camera.offset_s for camera in parsed.camera),
@@ -486,26 +490,31 @@ def _find_files(
     shared_params: dict[str, tuple[float, ...]],
     root: Path,
     path: Path,
+    faults: Faults,
 ) -> SessionCamera:
-    def find(key: str) -> FrameSource | None:
-        name = getattr(table, key)
-        if name is None:
-            return None
+    """Return a camera with its files; those that are missing are None, and told to `faults`."""
+
+    def opened(key: str, name: str) -> FrameSource:
         try:
             return open_source(root, name)
         except SessionError as error:
             raise SessionError(f"{path}: camera.{number}.{key}: {error}") from error
 
-    def find_file(key: str) -> Path | None:
-        name = getattr(table, key)
-        if name is None:
-            return None
+    def file_of(key: str, name: str) -> Path:
         file: Path = root / name
         if not file.is_file():
             raise SessionError(
-                f"{path}: camera.{number}.{key}: there is no file {name!r} in {root}"
+                f"{path}: camera.{number}.{key}: there is no file {name!r} in {root}{nearly(file)}"
             )
         return file
+
+    def find(key: str) -> FrameSource | None:
+        name = getattr(table, key)
+        return None if name is None else faults.of(lambda: opened(key, name))
+
+    def find_file(key: str) -> Path | None:
+        name = getattr(table, key)
+        return None if name is None else faults.of(lambda: file_of(key, name))
 
     pictures = {key: find(key) for key in ("intrinsics", "extrinsics", "background", "video")}
     bits = significant_bits(source for source in pictures.values() if source is not None)

@@ -100,6 +100,7 @@ class _Quantity:
 _QUANTITIES = (
     _Quantity("verdict", "", "exact"),
     _Quantity("trusted", "", "estimate"),
+    _Quantity("kept_rests_on", "", "exact"),
     _Quantity("clearance_lower", "mm", "bound"),
     _Quantity("clearance_upper", "mm", "bound"),
     _Quantity("clearance_at_least_95", "mm", "estimate"),
@@ -154,6 +155,7 @@ def _cell(summary: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         "report": summary["report"],
         "verdict": found["verdict"],
         "trusted": summary["trusted"],
+        "kept_rests_on": summary["kept_rests_on"],
         "clearance_lower_m": clearance.get("lower_m"),
         "clearance_upper_m": clearance.get("upper_m"),
         "clearance_at_least_95_m": clearance.get("at_least_95_m"),

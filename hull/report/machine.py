@@ -18,8 +18,6 @@ PACKAGES = (
     "moderngl",
     "h5py",
     "scipy",
-    "open3d-cpu",
-    "open3d",
     "cascadio",
 )
 
@@ -30,7 +28,7 @@ def software_versions() -> dict[str, str]:
     for package in PACKAGES:
         try:
             versions[package] = version(package)
-        except PackageNotFoundError:  # one of open3d-cpu and open3d is not there
+        except PackageNotFoundError:
             continue
     return versions
 

@@ -113,6 +113,26 @@ def writing(path: Path) -> Iterator[h5py.File]:
         raise ReportError(f"{path}: cannot be written: {error}") from error
 
 
+def parts_of(path: Path) -> Path:
+    """Return the folder beside a result in which its parts are gathered."""
+    return path.with_name(path.name + ".parts")
+
+
+def refuse_parts(parts: Path, *, resume: bool, overwrite: bool) -> None:
+    """Refuse to begin where the parts of a run stand that was cut off.
+
+    Raises
+    ------
+    ReportError
+        If they do, and are to be neither taken up nor replaced.
+    """
+    if parts.is_dir() and not resume and not overwrite:
+        raise ReportError(
+            f"{parts}: a run that was cut off stands there; take it up with --resume, or start "
+            "anew with --overwrite"
+        )
+
+
 def begin_parts(path: Path, parts: Path, stamp: str) -> None:
     """Make the empty folder in which the parts of a result are gathered, with what it is of.
 

@@ -35,8 +35,10 @@ from hybridve.hull.report.result_file import (
     STORED,
     Described,
     begin_parts,
+    parts_of,
     read_run,
     reading,
+    refuse_parts,
     store,
     store_text,
     write_run,
@@ -124,7 +126,8 @@ class SimulationWriter:
     ) -> None:
         self._path = path
         self._header = header
-        self._parts = path.with_name(path.name + ".parts")
+        self._parts = parts_of(path)
+        refuse_parts(self._parts, resume=resume, overwrite=overwrite)
         self._pending: list[SimulatedFrame] = []
         self._pending_bytes = 0
         self.n_done = 0
@@ -135,16 +138,11 @@ class SimulationWriter:
             "settings": told | {"rig": header.rig, "engine": header.engine, "effects": effects},
         }
         if self._parts.is_dir() and not overwrite:
-            self._take_up(json.loads(json.dumps(stamp)), resume=resume)
+            self._take_up(json.loads(json.dumps(stamp)))
         else:
             begin_parts(path, self._parts, json.dumps(stamp))
 
-    def _take_up(self, stamp: Mapping[str, Any], *, resume: bool) -> None:
-        if not resume:
-            raise ReportError(
-                f"{self._parts}: a run that was cut off stands there; take it up with --resume, "
-                "or start anew with --overwrite"
-            )
+    def _take_up(self, stamp: Mapping[str, Any]) -> None:
         path = self._parts / "settings.json"
         found = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
         for name, version in stamp["solvers"].items():

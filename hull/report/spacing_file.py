@@ -450,6 +450,7 @@ def _session_as_dict(one: SessionSpacing) -> dict[str, Any]:
         "settings": one.settings,
         "trusted": one.agreement.is_trusted,
         "causes": to_json(one.agreement.causes),
+        "rests_on": one.agreement.rests_on,
         "shift_m": to_json(one.shift_m),
         "at_least_m": to_json(one.at_least_m),
         "at_95": None

@@ -27,6 +27,8 @@ def summarize(report: Report) -> dict[str, Any]:
         ``frames``, ``frames_invalid``, ``frames_contradictory`` (of these), ``reasons`` (text to
         count) and ``reason_frames`` (text to numbers of frames),
         ``rests_on`` (what the emptiness of frames without a hull rests on, to count),
+        ``kept_rests_on`` (which cameras saw nothing in any frame, in words: all that is kept rests
+        on that; else empty),
         ``frames_without_hull`` (see `count_without_hull`), ``seconds`` (from first to last frame),
         ``engine``, ``renderer``, ``stage_ms_mean``, ``viewports`` (smallest and largest),
         ``samples``, ``sample_spacing_m`` (largest) and ``objects``, worst first: for each ``name``,
@@ -79,6 +81,7 @@ def summarize(report: Report) -> dict[str, Any]:
             for why in dict.fromkeys(report.reason[~is_valid].tolist())
         },
         "rests_on": dict(Counter(text for text in report.rests_on.tolist() if text)),
+        "kept_rests_on": report.agreement.rests_on,
         "frames_without_hull": count_without_hull(report),
         "seconds": float(report.time_s[-1] - report.time_s[0]) if len(report.time_s) else 0.0,
         "engine": report.attributes.get("engine", ""),

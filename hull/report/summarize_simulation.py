@@ -25,6 +25,7 @@ def summarize_simulation(simulation: StoredSimulation) -> dict[str, Any]:
         "solvers": simulation.settings["solvers"],
         "trusted": simulation.agreement.is_trusted,
         "causes": [to_plain(cause) for cause in simulation.agreement.causes],
+        "rests_on": simulation.agreement.rests_on,
         "frames_paused": len(paused),
         "reasons": {reason: paused.count(reason) for reason in dict.fromkeys(paused)},
         "stopped": simulation.stopped,

@@ -47,6 +47,8 @@ from hybridve.hull.report.machine import utc_now
 from hybridve.hull.report.result_file import (
     STORED,
     begin_parts,
+    parts_of,
+    refuse_parts,
     store,
     store_text,
     write_run,
@@ -98,27 +100,22 @@ class ReportWriter:
     ) -> None:
         self._path = path
         self._header = header
-        self._parts = path.with_name(path.name + ".parts")
+        self._parts = parts_of(path)
         self._pending: list[FrameResult] = []
         self._n_pending_runs = self._n_pending_vertices = 0
         self.n_done = 0
         self._write_s = 0.0
-        refuse_existing(path, overwrite=overwrite)
+        refuse_result(path, resume=resume, overwrite=overwrite)
         stamp = json.dumps(
             {"settings": header.settings, "rig": header.rig, "engine": header.engine},
             sort_keys=True,
         )
         if self._parts.is_dir() and not overwrite:
-            self._take_up(stamp, resume=resume)
+            self._take_up(stamp)
         else:
             begin_parts(path, self._parts, stamp)
 
-    def _take_up(self, stamp: str, *, resume: bool) -> None:
-        if not resume:
-            raise ReportError(
-                f"{self._parts}: a run that was cut off stands there; take it up with --resume, "
-                "or start anew with --overwrite"
-            )
+    def _take_up(self, stamp: str) -> None:
         settings = self._parts / "settings.json"
         if not settings.is_file() or settings.read_text(encoding="utf-8") != stamp:
             raise ReportError(
@@ -179,9 +176,9 @@ class ReportWriter:
         cameras = range(len(self._header.cameras))
         for part in self._part_columns(lambda key: key.startswith(("camera/", "frame/"))):
             each = [_outlines(part, number) for number in cameras]
-            deniers, supported, alone_px = (
+            deniers, supported, alone_px, object_share = (
                 np.array([part[_camera_key(number, name)] for number in cameras])
-                for name in ("is_denier", "supported_share", "alone_px")
+                for name in ("is_denier", "supported_share", "alone_px", "object_share")
             )
             for row, index in enumerate(part[_frame_key("index")].tolist()):
                 state = part[_frame_key("state")][row]
@@ -193,6 +190,7 @@ class ReportWriter:
                         deniers[:, row],
                         supported[:, row],
                         alone_px[:, row],
+                        object_share[:, row],
                         is_contradictory=state == "contradictory",
                     )
                 )
@@ -438,6 +436,37 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
         raise ReportError(f"{path}: cannot be written: there is no folder {folder}; make it first")
     if not os.access(folder, os.W_OK):
         raise ReportError(f"{path}: cannot be written: no permission to write to {folder}")
+
+
+def refuse_existing_in(folder: Path, name: str, *, overwrite: bool) -> None:
+    """Refuse a folder that is to be made if it is not there, and in which a file is to stand.
+
+    Raises
+    ------
+    ReportError
+        If it holds a file of that name and `overwrite` is not set, or cannot be made.
+    """
+    if folder.is_dir():
+        refuse_existing(folder / name, overwrite=overwrite)
+        return
+    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    if not there.is_dir():
+        raise ReportError(f"{folder}: cannot be made: {there} is a file; name a folder")
+    if not os.access(there, os.W_OK):
+        raise ReportError(f"{folder}: cannot be made: no permission to write to {there}")
+
+
+def refuse_result(path: Path, *, resume: bool, overwrite: bool) -> None:
+    """Refuse to begin a result that is gathered in parts beside it, where that may not be.
+
+    Raises
+    ------
+    ReportError
+        As of `refuse_existing`; or if the parts of a run that was cut off stand there, and are to
+        be neither taken up nor replaced.
+    """
+    refuse_existing(path, overwrite=overwrite)
+    refuse_parts(parts_of(path), resume=resume, overwrite=overwrite)
 
 
 #: Where the places of the file begin.
