@@ -125,7 +125,7 @@ def _nothing(chain: Chain) -> Hull:
 
 
 def drawn_objects(simulation: StoredSimulation, row: int) -> list[DrawnObject]:
-    """Return the CAD as it stood in a row: what effects move, and what stands."""
+    """Return the CAD as it stood in a row: what effects move, what files move, and what stands."""
     meshes = [
         (name, vertices_world, group.shown.faces)
         for name, group in simulation.groups.items()
@@ -135,6 +135,11 @@ def drawn_objects(simulation: StoredSimulation, row: int) -> list[DrawnObject]:
     ]
     taken = {name for name, _, _ in meshes}
     meshes += [one for one in simulation.standing if one[0] not in taken]
+    meshes += [
+        (name, placed(vertices, poses[row]), faces)
+        for name, vertices, faces, poses in simulation.moving
+        if name not in taken and np.isfinite(poses[row]).all()
+    ]
     return [
         DrawnObject(
             name,

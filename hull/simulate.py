@@ -7,8 +7,9 @@
     scene -> effects -------+
 
 Time goes on from frame to frame. The first frame with a hull shows the state that the scene gives;
-each later one what the steps since the frame before made of it. A frame without a hull is a pause:
-nothing goes on, and the hull of the next is taken to have been there all along.
+each later one what the steps since the frame before made of it. A frame without a hull, or in which
+a part that moves has no pose, is a pause: nothing goes on, and the hull of the next, with all parts
+that move, is taken to have been there all along.
 """
 
 import time
@@ -22,10 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError, SessionError, ask_all
+from hybridve.calib.pose import compose, invert, placed
 from hybridve.hull.about import about_rig, local_origin_m, resolved_settings
 from hybridve.hull.agreement.frame import judge_frame
 from hybridve.hull.agreement.outlines import FrameOutlines
-from hybridve.hull.cad.scene import Scene, load_scene
+from hybridve.hull.cad.motion import Motion
+from hybridve.hull.cad.scene import Scene, SceneObject, load_scene
 from hybridve.hull.capture.inspection import opened_session
 from hybridve.hull.chain import (
     Chain,
@@ -40,6 +43,8 @@ from hybridve.hull.effects.effect import (
     Effect,
     Entry,
     Instant,
+    Onlooker,
+    Placed,
     Quantity,
     Setting,
     UnstableError,
@@ -187,13 +192,6 @@ class Simulation:
     def of(cls, chain: Chain, engine: Engine, settings: SimulateSettings) -> "Simulation":
         """Return the effects of a chain's scene, at their beginning."""
         found = read_entries(chain.scene)
-        for one in chain.scene.objects:
-            if one.motion is not None:
-                raise SceneError(
-                    f"{chain.scene.path}: object {one.name!r} moves as a file says, and effects "
-                    "meet CAD that stands only; simulate with a scene in which it stands, or is "
-                    "left out"
-                )
         claimed = frozenset(name for entry, _ in found for name in entry.table.claimed)
         setting = Setting(
             scene=chain.scene,
@@ -306,14 +304,14 @@ class Simulation:
         n_steps = n_hulls = 0
         blew_up = ""
         if frame.hull is not None and self.has_begun:
-            for instant, steps in _timed(self._instants(before, frame, frame.hull), stage_s):
+            for steps in _timed(self._instants(before, frame, frame.hull), stage_s):
                 n_hulls += 1
-                n_steps += steps
-                step_s = instant.elapsed_s / steps
+                n_steps += len(steps)
+                step_s = steps[0].elapsed_s / len(steps)
                 for number, (effect, names) in enumerate(self.effects):
                     started = time.perf_counter()
                     try:
-                        for _ in range(steps):
+                        for instant in steps:
                             effect.advance(instant, step_s)
                     except UnstableError as error:
                         blew_up = f"frame {frame.index}: {', '.join(names)}: {error}"
@@ -325,12 +323,18 @@ class Simulation:
         elif frame.hull is not None:
             self.has_begun = True
         values: dict[str, dict[str, NDArray[Any]]] = {}
-        for number, (effect, names) in enumerate(self.effects):
+        there = self._driven(frame.index)
+        # Who looks on comes last: what the others move has its place by then.
+        for number in sorted(range(len(self.effects)), key=self._looks_on):
+            effect, names = self.effects[number]
             started = time.perf_counter()
+            if isinstance(effect, Onlooker):
+                effect.see_objects(there)
             told = effect.values(frame.hull)
             seconds[number] += time.perf_counter() - started
             for name in names:
                 values[name] = {**told[name], "step_s": np.array(seconds[number])}
+                there |= self._simulated(effect, name, told[name])
         return SimulatedFrame(
             index=frame.index,
             time_s=frame.time_s,
@@ -341,13 +345,51 @@ class Simulation:
             values=values,
             outlines=outlines,
             blew_up=blew_up,
+            poses={
+                one.name: compose(pose, one.world_from_mesh)
+                for one in self.chain.scene.objects
+                if one.motion is not None
+                and (pose := one.motion.world_from_rest(frame.index)) is not None
+            },
         )
+
+    def _looks_on(self, number: int) -> bool:
+        return isinstance(self.effects[number][0], Onlooker)
+
+    @property
+    def _motions(self) -> dict[str, Motion]:
+        """How the objects move that do so as files say, by name."""
+        return {one.name: one.motion for one in self.chain.scene.objects if one.motion is not None}
+
+    def _driven(self, index: int) -> dict[str, Placed]:
+        """Return where the objects are in a frame that move as files say."""
+        found = {}
+        for one in self.chain.scene.objects:
+            if one.motion is not None:
+                pose = one.motion.last_known(index)
+                found[one.name] = Placed(one.at(pose).vertices_world, pose)
+        return found
+
+    def _simulated(
+        self, effect: Effect, name: str, values: Mapping[str, NDArray[Any]]
+    ) -> dict[str, Placed]:
+        """Return where the object is that an entry moves, by what is told of it."""
+        drawn = effect.told[name].drawn
+        (entry,) = (one for one in self.entries if one.name == name)
+        moved = [one for one in self.chain.scene.objects if one.name in entry.table.claimed]
+        if drawn is None or not drawn.column or len(moved) != 1:
+            return {}
+        (one,), there = moved, values[drawn.column]
+        if there.shape not in ((3, 4), one.vertices_world.shape):
+            return {}
+        return {one.name: _placed(one, there)}
 
     def _instants(
         self, before: FrameHull | None, frame: FrameHull, hull: Hull
-    ) -> Iterator[tuple[Instant, int]]:
+    ) -> Iterator[Sequence[Instant]]:
         step = self.chain.settings.frames.step
         elapsed_s = step / self.chain.session.fps
+        is_known = before is not None and before.hull is not None
         return instants(
             None if before is None else before.hull,
             hull,
@@ -356,6 +398,8 @@ class Simulation:
             frame=frame.index,
             step_s=self.step_s,
             mode=self.hull,
+            motions=self._motions,
+            since=before.index if before is not None and is_known else None,
         )
 
     def header(self, settings: SimulateSettings, engine: Engine) -> SimulationHeader:
@@ -385,7 +429,13 @@ class Simulation:
             standing=tuple(
                 (one.name, one.vertices_world, one.faces)
                 for one in chain.scene.objects
-                if not any(one.name in entry.table.claimed for entry in self.entries)
+                if one.motion is None
+                and not any(one.name in entry.table.claimed for entry in self.entries)
+            ),
+            moving=tuple(
+                (one.name, _mesh_of(one), one.faces)
+                for one in chain.scene.objects
+                if one.motion is not None
             ),
         )
 
@@ -409,9 +459,22 @@ _KEPT = (
 )
 
 
+def _mesh_of(one: SceneObject) -> NDArray[np.float64]:
+    """Return the vertices (V, 3) of an object in the frame of its mesh, metres."""
+    return one.vertices_world if one.vertices_mesh is None else one.vertices_mesh
+
+
+def _placed(one: SceneObject, told: NDArray[Any]) -> Placed:
+    """Return where an object is, of its world_from_mesh (3, 4) or its vertices (V, 3)."""
+    if told.shape == (3, 4):
+        world_from_rest = compose(told, invert(one.world_from_mesh))
+        return Placed(placed(_mesh_of(one), told), world_from_rest)
+    return Placed(np.asarray(told, np.float64), None)
+
+
 def _timed(
-    found: Iterator[tuple[Instant, int]], stage_s: dict[str, float]
-) -> Iterator[tuple[Instant, int]]:
+    found: Iterator[Sequence[Instant]], stage_s: dict[str, float]
+) -> Iterator[Sequence[Instant]]:
     """Yield what comes, and add the seconds it takes to come to the stage "between"."""
     while True:
         started = time.perf_counter()

@@ -3,12 +3,17 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from helpers.motions import angles_csv
 from helpers.sessions import write_ball_session, write_cube_scene
+from scipy.spatial.transform import Rotation
 
+from hybridve.calib.pose import placed
+from hybridve.hull.effects.instants import instants
 from hybridve.hull.report.simulation_file import read_simulation
 
 Run = Callable[..., int]
@@ -200,16 +205,118 @@ def test_a_step_that_the_stiffness_cannot_bear_is_refused_with_the_longest(
     assert "stretch_n_m" in capsys.readouterr().err
 
 
-def test_cad_that_moves_is_refused_by_name(
-    run: Run, tmp_path: Path, session: Path, capsys: pytest.CaptureFixture[str]
+#: A block turns on a hinge and pushes a box; whatever else is simulated meets or tells of it.
+MOVING = """
+[[object]]
+name = "board"
+mesh = "cube.obj"
+unit = "mm"
+translate_mm = [0, -420, 300]
+hinge = { axis = [0, 0, 1], anchor_mm = [-300, 0, 0], angles = "angles.csv" }
+
+[[effect]]
+kind = "rigid"
+object = "box"
+mass_kg = 0.5
+gravity = false
+restitution = 1.0
+
+[[effect]]
+kind = "cloth"
+object = "sheet"
+
+[[effect]]
+kind = "particles"
+count = 50
+source_mm = [-100, -300, 300, 100, -250, 350]
+lifetime_s = 5
+
+[[effect]]
+kind = "shadow"
+lamp_mm = [0, 300, 1200]
+objects = ["ground", "board", "box"]
+
+[[effect]]
+kind = "proximity"
+object = "board"
+zones_mm = [400, 150]
+"""
+
+
+def write_moving_scene(folder: Path, angles_deg: dict[int, float]) -> Path:
+    scene = write_scene(folder, MOVING)
+    (folder / "angles.csv").write_text(angles_csv(angles_deg), encoding="utf-8")
+    text = scene.read_text(encoding="utf-8").replace("translate_mm = [250.0", "translate_mm = [0.0")
+    scene.write_text(text.replace("[0.0, 0.0, 0.0]", "[0, -180, 300]"), encoding="utf-8")
+    return scene
+
+
+@pytest.mark.slow
+def test_cad_that_moves_is_met_told_of_drawn_and_paused_without_a_pose(
+    run: Run, tmp_path: Path, session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = write_scene(tmp_path, '\n[[effect]]\nkind = "cloth"\nobject = "sheet"\n')
-    (tmp_path / "door.csv").write_text("frame,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n")
-    text = scene.read_text(encoding="utf-8").replace(
-        'name = "door"', 'name = "door"\nposes = "door.csv"'
-    )
-    scene.write_text(text, encoding="utf-8")
+    angles = {0: 0.0, 1: 4.0, 2: 8.0, 3: 12.0, 5: 20.0, 6: 24.0}
+    scene, whole, cut = write_moving_scene(tmp_path, angles), tmp_path / "w.h5", tmp_path / "c.h5"
 
-    assert run("simulate", session, "--scene", scene, "-o", tmp_path / "sim.h5") == 1
+    assert run("simulate", session, "--scene", scene, "-o", whole) == 0
 
-    assert "object 'door' moves as a file says" in capsys.readouterr().err
+    found = read_simulation(whole)
+    assert [bool(reason) for reason in found.reason] == [frame == 4 for frame in range(7)]
+    assert found.reason[4] == "no pose of object 'board' in frame 4"
+    assert found.n_steps[4] == 0
+    ((name, mesh, _, poses),) = found.moving
+    assert name == "board"
+    assert np.isnan(poses[4]).all()
+    hinge = np.array([-0.3, -0.42, 0.3])
+    for frame, angle_deg in angles.items():
+        turn = Rotation.from_rotvec([0, 0, angle_deg], degrees=True).as_matrix()
+        expected = (mesh + np.array([0.3, 0, 0])) @ turn.T + hinge
+        there = mesh @ poses[frame, :, :3].T + poses[frame, :, 3]
+        np.testing.assert_allclose(there, expected, atol=1e-9)
+        told = found.groups["board.proximity"].values["vertices_m"][frame]
+        np.testing.assert_allclose(told, expected, atol=1e-9)
+    box = found.groups["box"].values
+    assert box["velocity_m_s"][-1, 1] > 0.5
+    assert box["cad_work_j"][-1] > 0.0
+    # The shadow is told of the box where the simulation has it.
+    shadow = found.groups["shadow"]
+    shown = found.groups["box"].shown
+    assert shown is not None
+    assert shown.vertices is not None
+    moved = placed(shown.vertices, box["world_from_mesh"][-1])
+    np.testing.assert_allclose(shadow.values["vertices_m"][-1, -8:], moved, atol=1e-9)
+
+    monkeypatch.setattr("hybridve.hull.report.simulation_file._PART_FRAMES", 3)
+    break_at(monkeypatch, 5)
+    assert run("simulate", session, "--scene", scene, "-o", cut) == 130
+    monkeypatch.undo()
+    assert run("simulate", session, "--scene", scene, "-o", cut, "--resume") == 0
+    with h5py.File(whole) as one, h5py.File(cut) as other:
+        columns = datasets(one)
+        assert len(columns) > 40
+        for key, values in columns.items():
+            np.testing.assert_array_equal(values, other[key][()], err_msg=key)
+
+
+def datasets(file: h5py.File) -> dict[str, np.ndarray]:
+    """Return all that is told of effects and of CAD that moves, but timings."""
+    found: dict[str, np.ndarray] = {}
+
+    def visit(name: str, item: h5py.HLObject) -> None:
+        if isinstance(item, h5py.Dataset) and not name.endswith("step_s"):
+            found[f"hybridve/{name}"] = item[()]
+
+    file["hybridve/effects"].visititems(lambda name, item: visit(f"effects/{name}", item))
+    file["hybridve/moving"].visititems(lambda name, item: visit(f"moving/{name}", item))
+    return found
+
+
+def break_at(monkeypatch: pytest.MonkeyPatch, frame: int) -> None:
+    """Interrupt the simulation in a frame."""
+
+    def broken(*hulls: Any, **keys: Any) -> Any:
+        if keys["frame"] == frame:
+            raise KeyboardInterrupt
+        return instants(*hulls, **keys)
+
+    monkeypatch.setattr("hybridve.hull.simulate.instants", broken)

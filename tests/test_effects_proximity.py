@@ -231,7 +231,6 @@ def test_it_goes_on_from_its_state_to_the_bit() -> None:
     ("keys", "line"),
     [
         ({"object": "cub"}, "effect.1.object: there is no object 'cub'; the scene has cube, door"),
-        ({"object": "door"}, "effect.1.object: 'door' is moved by another effect"),
     ],
 )
 def test_an_object_that_cannot_be_watched_is_refused(keys: dict[str, Any], line: str) -> None:

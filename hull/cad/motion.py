@@ -103,6 +103,14 @@ class Motion:
         """Return where the object was in a frame, (3, 4); None where that is not known."""
         return self.poses.get(index)
 
+    def last_known(self, index: int) -> Pose:
+        """Return world_from_rest (3, 4) of the last frame up to this one that has it.
+
+        Of the first that has one, where none before has.
+        """
+        known = sorted(self.poses)
+        return self.poses[max((frame for frame in known if frame <= index), default=known[0])]
+
     def between(self, before: int, after: int, fraction: float) -> Pose:
         """Return the estimated world_from_rest (3, 4) of an instant between two frames.
 

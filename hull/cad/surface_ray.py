@@ -4,6 +4,8 @@ The tree is that of `hybridve.hull.cad.surface_tree`. A triangle counts as a lit
 is, lest a segment pass between two neighbours by rounding.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +24,31 @@ def tree_of(corners: NDArray[np.float64]) -> SurfaceTree:
     if len(corners) == 0:
         corners = np.zeros((1, 3, 3))  # a point has no area
     return make_tree(corners, corners)
+
+
+def joined(trees: Sequence[SurfaceTree]) -> tuple[SurfaceTree, NDArray[np.int64]]:
+    """Return trees as one that holds them all, and where the root of each is in it."""
+    nodes = np.cumsum([0] + [len(tree.child) for tree in trees])
+    triangles = np.cumsum([0] + [len(tree.solid) for tree in trees])
+    parts = [
+        tree._replace(
+            child=np.where(tree.child < 0, -1, tree.child + node),
+            first=tree.first + triangle,
+            number=tree.number + triangle,
+        )
+        for tree, node, triangle in zip(trees, nodes, triangles, strict=False)
+    ]
+    whole = SurfaceTree(
+        box=np.concatenate([part.box for part in parts]),
+        child=np.concatenate([part.child for part in parts]),
+        first=np.concatenate([part.first for part in parts]),
+        n_triangles=np.concatenate([part.n_triangles for part in parts]),
+        number=np.concatenate([part.number for part in parts]),
+        frame=np.concatenate([part.frame for part in parts]),
+        solid=np.concatenate([part.solid for part in parts]),
+        longest_m=max(part.longest_m for part in parts),
+    )
+    return whole, nodes[:-1]
 
 
 @compiled
@@ -89,6 +116,7 @@ def first_triangle(
     until: float,
     tree: SurfaceTree,
     waiting: NDArray[np.int64],
+    root: int,
 ) -> tuple[float, int]:
     """Return where a segment first meets a triangle, and which of ``tree.solid`` that is.
 
@@ -102,6 +130,8 @@ def first_triangle(
         The triangles.
     waiting : (`WAITING`,) int64
         Room for a stack.
+    root : int
+        The node below which they are: `ZERO` for all.
 
     Returns
     -------
@@ -111,7 +141,7 @@ def first_triangle(
         In the tree's order; -1 if it meets none.
     """
     nearest, found = until, -1
-    waiting[0] = 0
+    waiting[0] = root
     n_waiting = 1
     while n_waiting > 0:
         n_waiting -= 1

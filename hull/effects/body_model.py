@@ -4,7 +4,7 @@ Every body is a tree of its own with its frame at the centre of mass and along t
 so that the mass matrix is diagonal. The model's origin is the local one of the cameras.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import SceneError
-from hybridve.calib.pose import rotation_of
+from hybridve.calib.pose import Pose, rotation_of
 from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.effects.body_shape import (
     CollisionShape,
@@ -20,7 +20,7 @@ from hybridve.hull.effects.body_shape import (
     collision_shape,
     cross,
 )
-from hybridve.hull.effects.effect import GRAVITY_M_S2
+from hybridve.hull.effects.effect import GRAVITY_M_S2, Course
 
 #: How hard MuJoCo's constraints are: as hard as it allows. `hybridve.hull.effects.body_solver`
 #: makes them harder still.
@@ -116,6 +116,8 @@ class World:
         What collides in place of each object.
     body_id, geom_id : (B,) int64
         MuJoCo's number of each body, and of one of its geoms.
+    obstacle_id : dict of str to int
+        MuJoCo's number of the body that stands for each object of CAD.
     hull_geom : int
         The geom that contacts with the hull are told of.
     qpos_at, dof_at : (B,) int64
@@ -125,7 +127,7 @@ class World:
     mass_diagonal : (nv,) float64
         The mass matrix.
     restitution : (n bodies of MuJoCo,) float64
-        Of each of its bodies; NaN for those that stand.
+        Of each of its bodies; NaN for CAD.
     unmet : tuple of (str, str)
         Hinged bodies and what they reach into at the start; these do not meet.
     """
@@ -136,6 +138,7 @@ class World:
     shapes: dict[str, CollisionShape]
     body_id: NDArray[np.int64]
     geom_id: NDArray[np.int64]
+    obstacle_id: dict[str, int]
     hull_geom: int
     qpos_at: NDArray[np.int64]
     dof_at: NDArray[np.int64]
@@ -148,7 +151,7 @@ class World:
 def make_world(
     plans: Sequence[BodyPlan], obstacles: Sequence[SceneObject], origin_world: NDArray[np.float64]
 ) -> World:
-    """Return the model of bodies and of the CAD that they meet.
+    """Return the model of bodies and of the CAD that they meet, which is at rest in it.
 
     Raises
     ------
@@ -198,7 +201,7 @@ def _compiled(
     )
     marker.contype, marker.conaffinity = 0, 0
     for one in obstacles:
-        # As something that can be moved, though it stands: where CAD moves, only its pose does.
+        # As something that can be moved: where CAD moves, only its pose does.
         body = spec.worldbody.add_body(name=f"obstacle {one.name}", mocap=True)
         pieces = [points - origin_world for points in shapes[one.name].pieces]
         _add_pieces(spec, body, one.name, pieces, friction=0.0)
@@ -222,6 +225,7 @@ def _compiled(
         shapes=shapes,
         body_id=body_id,
         geom_id=model.body_geomadr[body_id].astype(np.int64),
+        obstacle_id={one.name: int(model.body(f"obstacle {one.name}").id) for one in obstacles},
         hull_geom=int(model.geom(_HULL).id),
         qpos_at=model.jnt_qposadr[joint].astype(np.int64),
         dof_at=dof_at,
@@ -319,6 +323,32 @@ def start_of(world: World) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return positions, velocities
 
 
+def place_cad(world: World, data: mujoco.MjData, world_from_rest: Mapping[str, Pose]) -> None:
+    """Put objects of CAD, by name, where they are seen from where the scene puts them."""
+    origin = world.origin_world
+    for name, pose in world_from_rest.items():
+        at = world.model.body_mocapid[world.obstacle_id[name]]
+        rotation = np.ascontiguousarray(pose[:, :3])
+        data.mocap_pos[at] = rotation @ origin + pose[:, 3] - origin
+        mujoco.mju_mat2Quat(data.mocap_quat[at], rotation.ravel())
+
+
+def cad_rates(
+    world: World, courses: Mapping[str, Course], step_s: float
+) -> dict[int, NDArray[np.float64]]:
+    """Return by MuJoCo's number of CAD that moves what takes a point of it to its velocity.
+
+    (3, 4) each, of a point in the model's frame in the middle of the step.
+    """
+    rates = {}
+    for name, course in courses.items():
+        velocity = course.velocity(step_s)
+        turning = velocity[:, :3] @ course.middle[:, :3].T
+        shift = turning @ (world.origin_world - course.middle[:, 3]) + velocity[:, 3]
+        rates[world.obstacle_id[name]] = np.column_stack([turning, shift])
+    return rates
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
     """Where bodies are.
@@ -400,10 +430,11 @@ def energies(
 def _overlaps_of_hinges(
     world: World, obstacles: Sequence[SceneObject]
 ) -> tuple[tuple[str, str], ...]:
-    """Return the hinged bodies and the obstacles that they reach into at the start.
+    """Return the hinged bodies and the CAD that stands and that they reach into at the start.
 
     A door overlaps its frame where it hangs. Were they to meet, it would never turn.
     """
+    obstacles = [one for one in obstacles if one.motion is None]
     if world.is_free.all() or not obstacles:
         return ()
     data = mujoco.MjData(world.model)
@@ -413,7 +444,7 @@ def _overlaps_of_hinges(
         int(world.body_id[body]): world.plans[body].name
         for body in np.flatnonzero(~world.is_free).tolist()
     }
-    standing = {world.model.body(f"obstacle {one.name}").id: one.name for one in obstacles}
+    standing = {world.obstacle_id[one.name]: one.name for one in obstacles}
     found = set()
     for pair in world.model.geom_bodyid[data.contact.geom].tolist():
         for body, other in (pair, pair[::-1]):

@@ -7,11 +7,12 @@ that turning keeps its energy too.
 
 Contacts are not springs. Of each the velocity after the step is known: away from each other at the
 restitution's share of the approach, or none at all where the approach is no more than weight gives
-in a step. MuJoCo's solver is told so through the reference acceleration of its row, as hard as
-double precision bears, and finds the forces that reach it, never pulling, within the cone of
-friction. That cone is dual to a cone of velocities, in which what slides lifts off at friction's
-share of its speed; the share is taken off the reference, and the solve repeated until it is right
-(De Saxce and Feng 1998; Acary, Cadoux, Lemarechal and Malick 2011).
+in a step; where CAD moves, that is the velocity beside its own. MuJoCo's solver is told so through
+the reference acceleration of its row, as hard as double precision bears, and finds the forces that
+reach it, never pulling, within the cone of friction. That cone is dual to a cone of velocities, in
+which what slides lifts off at friction's share of its speed; the share is taken off the reference,
+and the solve repeated until it is right (De Saxce and Feng 1998; Acary, Cadoux, Lemarechal and
+Malick 2011).
 
 Depth is taken away by displacements that are solved for in the same way, as velocities of no
 kinetic energy: a body between two hands, or a stack on one, goes where all contacts let it.
@@ -21,8 +22,8 @@ References
 Moreau, *Unilateral contact and dry friction in finite freedom dynamics*, 1988.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -105,6 +106,8 @@ class Solved:
         Whether anything met anything, stops included.
     missed_m_s : float
         By how much something moves farther into the hull than it was to, at most.
+    cad_work_j : dict of int to float
+        What CAD that moves does to what it meets, by MuJoCo's number of the latter.
     """
 
     change: NDArray[np.float64]
@@ -112,6 +115,7 @@ class Solved:
     joined: NDArray[np.int64]
     meets: bool
     missed_m_s: float = 0.0
+    cad_work_j: Mapping[int, float] = field(default_factory=dict)
 
 
 def least_impact(step_s: float) -> float:
@@ -180,6 +184,7 @@ def solve_velocities(
     step_s: float,
     *,
     n_own: int,
+    moving: Mapping[int, NDArray[np.float64]],
     bounces: bool = True,
 ) -> Solved:
     """Return the velocities after a step in which bodies meet; `free_velocities` came before.
@@ -196,6 +201,8 @@ def solve_velocities(
         Seconds.
     n_own : int
         How many contacts MuJoCo itself found; what others were added before goes.
+    moving : mapping of int to (3, 4) float64
+        CAD that moves; see `hybridve.hull.effects.body_model.cad_rates`.
     bounces : bool
         Whether bodies bounce off each other, the CAD and their stops.
     """
@@ -205,7 +212,9 @@ def solve_velocities(
     if data.nefc == 0:
         free = np.asarray(velocities + step_s * data.qacc_smooth)
         return Solved(free, np.zeros(len(rows)), np.zeros((0, 2), np.int64), False)
-    before = _row_rates(world, data, velocities)
+    # Rates of rows are those of bodies beside the CAD that they meet.
+    beside = _cad_row_rates(world, data, n_own, moving)
+    before = _row_rates(world, data, velocities) + beside
     after = np.zeros(data.nefc)  # of friction, in contacts and in joints: at rest
     limits = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
     address = np.asarray(data.contact.efc_address, np.int64)
@@ -240,7 +249,7 @@ def solve_velocities(
         found = velocities + step_s * data.qacc
         if not len(at):
             break
-        reached = _row_rates(world, data, found)
+        reached = _row_rates(world, data, found) + beside
         then = np.hypot(reached[at + 1], reached[at + 2])
         is_known = np.abs(then - slip).max() <= _SLIP_TOLERANCE
         slip = then
@@ -252,7 +261,16 @@ def solve_velocities(
     asked = np.array([row.after_m_s for row in rows])
     missed_m_s = float((asked - reached).max(initial=0.0))
     meets = data.ncon > 0 or len(limits) > 0
-    return Solved(np.asarray(found), impulses, pairs.astype(np.int64), meets, missed_m_s)
+    cad_work_j: dict[int, float] = {}
+    for contact in range(n_own if moving else 0):
+        rows_of = slice(address[contact], address[contact] + data.contact[contact].dim)
+        work_j = -step_s * float(np.asarray(data.efc_force)[rows_of] @ beside[rows_of])
+        for body in pairs[contact].tolist():
+            if address[contact] >= 0 and body not in moving:
+                cad_work_j[body] = cad_work_j.get(body, 0.0) + work_j
+    return Solved(
+        np.asarray(found), impulses, pairs.astype(np.int64), meets, missed_m_s, cad_work_j
+    )
 
 
 def own_depth(world: World, data: mujoco.MjData, positions: NDArray[np.float64]) -> float:
@@ -339,6 +357,27 @@ def _constrain(
     mujoco.mj_projectConstraint(world.model, data)
     data.efc_R[:] *= softness
     data.efc_D[:] = 1.0 / np.asarray(data.efc_R)
+
+
+def _cad_row_rates(
+    world: World,
+    data: mujoco.MjData,
+    n_own: int,
+    moving: Mapping[int, NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Return the rates of all rows that the motion of CAD makes, of bodies at rest."""
+    found = np.zeros(data.nefc)
+    for number in range(n_own if moving else 0):
+        contact = data.contact[number]
+        if contact.efc_address < 0:
+            continue
+        for geom, sign in zip(contact.geom.tolist(), (-1.0, 1.0), strict=True):
+            rates = moving.get(int(world.model.geom_bodyid[geom]))
+            if rates is not None:
+                velocity = rates[:, :3] @ contact.pos + rates[:, 3]
+                rows = contact.frame.reshape(3, 3)[: contact.dim] @ velocity
+                found[contact.efc_address : contact.efc_address + contact.dim] += sign * rows
+    return found
 
 
 def _row_rates(

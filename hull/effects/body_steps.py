@@ -11,9 +11,13 @@ What a step does, in its order:
 3. The hull is asked again, and what is still in it, in CAD or in another body is moved out, without
    a velocity.
 
-Energy may come from the hull alone: its speed at contacts times their impulses, and the height that
-bodies are moved out to. Newton's restitution with friction can make some where many contacts meet;
-where it would, the step is solved without bouncing, and what were left is taken off the speed.
+CAD that moves as a file says is where it is in the middle of the step while velocities are solved
+for, and at its end while bodies are moved out.
+
+Energy may come from the hull and from CAD that moves alone: their speed at contacts times their
+impulses, and the height that bodies are moved out to. Newton's restitution with friction can make
+some where many contacts meet; where it would, the step is solved without bouncing, and what were
+left is taken off the speed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,8 +32,10 @@ from scipy.sparse.csgraph import connected_components
 
 from hybridve.hull.effects.body_model import (
     BodyPlan,
+    cad_rates,
     energies,
     make_world,
+    place_cad,
     places_of,
     start_of,
     twist_of,
@@ -137,7 +143,7 @@ class Bodies:
         self._potential_at_start_j = self._energies()[1]
         self._books = [Books() for _ in plans]
         self._asked: _Asked | None = None
-        self._moved_out: tuple[Hull, NDArray[np.float64]] | None = None
+        self._moved_out: tuple[Instant, NDArray[np.float64]] | None = None
         self.told = {plan.name: told_of(self._world, plan) for plan in plans}
 
     def advance(self, instant: Instant, step_s: float) -> None:
@@ -146,9 +152,11 @@ class Bodies:
         self._damp(step_s)
         before_j = float(np.sum(self._energies()))
         middle = moved(world, self._positions, self._velocities, 0.5 * step_s)
+        place_cad(world, data, {name: one.middle for name, one in instant.courses.items()})
         free = free_velocities(world, data, middle, self._velocities, step_s)
         self._check(free)
         ahead = moved(world, middle, free, 0.5 * step_s)
+        moving = cad_rates(world, instant.courses, step_s)
         asked = self._ask(instant, ahead)
         contacts = asked.contacts
         n_own = data.ncon
@@ -164,12 +172,14 @@ class Bodies:
                 [hit.row for hit in hits],
                 step_s,
                 n_own=n_own,
+                moving=moving,
                 bounces=attempt == "bounce",
             )
             ended = moved(world, ahead, times * (solved.change - free), 1.0)
             work_j = solved.hull_impulse * [hit.hull_m_s for hit in hits]
             kinetic, potential = energies(world, places_of(world, ended), solved.change)
-            made_j = float(kinetic.sum() + potential.sum() - work_j.sum()) - before_j
+            given_j = float(work_j.sum()) + sum(solved.cad_work_j.values())
+            made_j = float(kinetic.sum() + potential.sum()) - given_j - before_j
             is_passive = not solved.meets or made_j <= _MADE * float(kinetic.sum())
             if is_passive and solved.missed_m_s <= _MISSED * max(1.0, float(np.abs(free).max())):
                 break
@@ -178,10 +188,12 @@ class Bodies:
         self._positions, self._velocities = ended, solved.change
         for hit, joules in zip(hits, work_j.tolist(), strict=True):
             self._books[hit.row.body].hull_work_j += joules
+        for body, number in enumerate(world.body_id.tolist()):
+            self._books[body].cad_work_j += solved.cad_work_j.get(number, 0.0)
         for body, contact in contacts:
             self._books[body].meet(contact)
         self._check(self._velocities)
-        self._move_out(instant.hull, near_hull=asked.meets)
+        self._move_out(instant, near_hull=asked.meets)
 
     def values(self, hull: Hull | None) -> Mapping[str, Mapping[str, NDArray[Any]]]:  # noqa: ARG002
         """Return by entry and column what stands at the end of a frame; counts begin anew."""
@@ -195,6 +207,7 @@ class Bodies:
                 "hull_work_j": np.asarray(books.hull_work_j),
                 "penetration_m": np.asarray(books.penetration_m),
                 "n_contacts": np.asarray(books.n_contacts, np.uint32),
+                "cad_work_j": np.asarray(books.cad_work_j),
                 **pose_of(self._world, self._scene_places, self._positions, self._velocities, body),
                 **dict(
                     zip(("cp_obj_m", "cp_hull_m", "v_rec", "n_hull"), books.arrows, strict=True)
@@ -211,6 +224,7 @@ class Bodies:
             "positions": self._positions.copy(),
             "velocities": self._velocities.copy(),
             "hull_work_j": np.array([books.hull_work_j for books in self._books]),
+            "cad_work_j": np.array([books.cad_work_j for books in self._books]),
             "penetration_m": np.array([books.penetration_m for books in self._books]),
             "n_contacts": np.array([books.n_contacts for books in self._books], np.int64),
             "deepest_m": np.array([books.deepest_m for books in self._books]),
@@ -223,9 +237,17 @@ class Bodies:
         self._positions = np.array(state["positions"], np.float64)
         self._velocities = np.array(state["velocities"], np.float64)
         self._books = [
-            Books(float(work_j), float(penetration_m), int(count), float(deepest_m), arrows.copy())
-            for work_j, penetration_m, count, deepest_m, arrows in zip(
+            Books(
+                float(work_j),
+                float(cad_work_j),
+                float(penetration_m),
+                int(count),
+                float(deepest_m),
+                arrows.copy(),
+            )
+            for work_j, cad_work_j, penetration_m, count, deepest_m, arrows in zip(
                 state["hull_work_j"],
+                state["cad_work_j"],
                 state["penetration_m"],
                 state["n_contacts"],
                 state["deepest_m"],
@@ -309,7 +331,7 @@ class Bodies:
         asked = self._asked
         if (
             asked is None
-            or asked.instant is not instant
+            or not _asks_the_same(asked.instant, instant)
             or np.abs(asked.positions - positions).max() > _SAME_PLACE
         ):
             met = self._patches(instant.hull, positions)
@@ -415,12 +437,13 @@ class Bodies:
             ]
         return hits, times
 
-    def _move_out(self, hull: Hull, *, near_hull: bool) -> None:
+    def _move_out(self, instant: Instant, *, near_hull: bool) -> None:
         """Move bodies out of the hull, of CAD and of each other, and tell how deep they stay."""
-        world, data = self._world, self._data
-        if self._moved_out is not None:
+        world, data, hull = self._world, self._data, instant.hull
+        place_cad(world, data, {name: one.end for name, one in instant.courses.items()})
+        if self._moved_out is not None and not instant.courses:
             last, positions = self._moved_out
-            if last is hull and np.abs(positions - self._positions).max() <= _SAME_PLACE:
+            if last.hull is hull and np.abs(positions - self._positions).max() <= _SAME_PLACE:
                 return
         patches = self._patches(hull, self._positions) if near_hull else []
         for _ in range(_MOST_MOVES):
@@ -430,7 +453,7 @@ class Bodies:
             rows = self._rows_out(hull, patches) if deepest_m > SLOP_M else []
             is_out = all(row.depth_m <= 1.01 * SLOP_M for row in rows)
             if own_depth(world, data, self._positions) <= 0 and is_out:
-                self._moved_out = (hull, self._positions) if near_hull else None
+                self._moved_out = (instant, self._positions) if near_hull else None
                 break
             if not rows:
                 rows = self._rows_out(hull, patches)
@@ -438,8 +461,14 @@ class Bodies:
             before = self._energies()[1]
             self._positions = moved(world, self._positions, solved.change, 1.0)
             rose_j = self._energies()[1] - before
-            for body in self._pushed(rows, solved).tolist():
-                self._books[body].hull_work_j += rose_j[body]
+            is_pushed = self._pushed(rows, solved)
+            for books, joules, is_hull in zip(
+                self._books, rose_j.tolist(), is_pushed.tolist(), strict=True
+            ):
+                if is_hull:
+                    books.hull_work_j += joules
+                elif instant.courses:
+                    books.cad_work_j += joules
             if near_hull:
                 patches = self._patches(hull, self._positions)
         for body, found in patches:
@@ -477,8 +506,8 @@ class Bodies:
                 ]
         return rows
 
-    def _pushed(self, rows: Sequence[HullRow], solved: Solved) -> NDArray[np.int64]:
-        """Return the bodies that the hull moved, itself or through others."""
+    def _pushed(self, rows: Sequence[HullRow], solved: Solved) -> NDArray[np.bool_]:
+        """Return which bodies (B,) the hull moved, itself or through others."""
         world = self._world
         n_bodies = world.model.nbody
         moves = np.zeros(n_bodies, np.bool_)
@@ -489,7 +518,17 @@ class Bodies:
         )
         label = connected_components(graph, directed=False)[1]
         touched = label[world.body_id[[row.body for row in rows]]]
-        return np.flatnonzero(np.isin(label[world.body_id], touched))
+        return np.isin(label[world.body_id], touched)
+
+
+def _asks_the_same(one: Instant, other: Instant) -> bool:
+    """Tell whether the hull and what is known of its speed are the same at two instants."""
+    return one is other or (
+        one.hull is other.hull
+        and one.before is other.before
+        and one.recorded == other.recorded
+        and one.elapsed_s == other.elapsed_s
+    )
 
 
 def _calmed(hit: _Hit, *, stands: bool) -> _Hit:

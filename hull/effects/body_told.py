@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hybridve.hull.effects.body_model import BodyPlan, Places, World, places_of, twist_of
 from hybridve.hull.effects.body_shape import CollisionShape
-from hybridve.hull.effects.effect import Drawn, Quantity, Told
+from hybridve.hull.effects.effect import CAD_WORK, Drawn, Quantity, Told
 from hybridve.hull.effects.hull_contacts import HullContact
 
 _POSE = Quantity(
@@ -18,6 +18,7 @@ _POSE = Quantity(
     "exact",
     "rotation and place of the mesh, of the simulated state",
     (3, 4),
+    is_place=True,
 )
 
 #: The arrows of the paper's figure 5, of the deepest contact since the frame before.
@@ -47,6 +48,7 @@ RIGID_COLUMNS = (
     Quantity("velocity_m_s", "m/s", "exact", "of the centre of mass", (3,)),
     Quantity("angular_velocity_rad_s", "rad/s", "exact", "in the world's frame", (3,)),
     _POSE,
+    CAD_WORK,
     *_ARROWS,
 )
 
@@ -54,6 +56,7 @@ HINGE_COLUMNS = (
     Quantity("angle_rad", "rad", "exact", "from its place in the scene, about its axis"),
     Quantity("angular_velocity_rad_s", "rad/s", "exact", "about its axis"),
     _POSE,
+    CAD_WORK,
     *_ARROWS,
 )
 
@@ -63,6 +66,7 @@ class Books:
     """What is told of one body, since the start or since the frame before."""
 
     hull_work_j: float = 0.0
+    cad_work_j: float = 0.0
     penetration_m: float = 0.0
     n_contacts: int = 0
     deepest_m: float = 0.0

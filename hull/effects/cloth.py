@@ -34,6 +34,7 @@ from hybridve.hull.effects.cloth_model import (
     why_no_sheet,
 )
 from hybridve.hull.effects.effect import (
+    CAD_WORK,
     GRAVITY_M_S2,
     Drawn,
     EffectKind,
@@ -232,6 +233,7 @@ class _Sheet:
             "contact_sample": np.full((len(faces), 3), -1, np.int64),
             "contact_way": np.zeros((len(faces), 3, 3)),
             "hull_work_j": np.zeros(1),
+            "cad_work_j": np.zeros(1),
             "penetration_m": np.zeros(1),
             "n_contacts": np.zeros(1, np.int64),
             "n_held": np.zeros(1, np.int64),
@@ -262,6 +264,7 @@ class _Sheet:
                     "is on pinned corners; penetration_m leaves them out",
                     dtype=np.uint32,
                 ),
+                CAD_WORK,
             ),
             drawn=Drawn("vertices_m", faces=thing.faces),
             about={
@@ -301,6 +304,7 @@ class _Sheet:
             "vertices_m": vertices,
             "displacement_m": moved_m.max(),
             "n_held": np.uint32(state["n_held"][0]),
+            "cad_work_j": state["cad_work_j"][0],
         }
         state["penetration_m"][:] = 0.0
         state["n_contacts"][:] = 0
@@ -313,7 +317,11 @@ class _Sheet:
         state = self.state
         near_m = 2.0 * step_s * float(np.sqrt((v * v).sum(axis=1).max())) + _NEAR_M
         in_hull = self._contacts_in_hull(instant)
-        others = [obstacle.contacts(x, near_m) for obstacle in self._obstacles]
+        others = [
+            obstacle.contacts(x, near_m, step_s, instant.courses.get(obstacle.name))
+            for obstacle in self._obstacles
+        ]
+        is_driven = any(bool(one.speed.any()) for one in others)
         n_steps = self._n_steps(step_s)
         is_held = np.zeros(len(x), np.bool_)
         lost_j, others_j = move_on(
@@ -330,6 +338,7 @@ class _Sheet:
             len(in_hull.level_m),
             self._friction,
             is_held,
+            is_driven,
         )
         if not (np.abs(x) < MAX_COORDINATE_M).all():
             raise UnstableError(
@@ -345,7 +354,7 @@ class _Sheet:
         is_pushed = self._get_out(before, instant)
         touched = is_held | is_pushed
         gain_j = sum(self._energies()) - before_j
-        is_still = instant.before is instant.hull or not touched.any()
+        is_still = not is_driven and (instant.before is instant.hull or not touched.any())
         if is_still and (has_contacts or touched.any()):
             gain_j -= self._take_back(gain_j, touched)
         if touched.any():
@@ -353,6 +362,8 @@ class _Sheet:
             # still only takes; what drag and damping take of trembling, it did not give.
             work_j = gain_j + lost_j - others_j
             state["hull_work_j"] += min(work_j, max(gain_j, 0.0)) if is_still else work_j
+        if is_driven:
+            state["cad_work_j"] += others_j
         state["n_contacts"] += int(touched.sum())
 
     def _n_steps(self, step_s: float) -> int:

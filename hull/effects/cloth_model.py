@@ -495,6 +495,7 @@ def move_on(
     n_in_hull: int,
     friction: float,
     is_held: NDArray[np.bool_],
+    is_driven: bool,
 ) -> tuple[float, float]:
     """Move nodes on in place, by so many steps.
 
@@ -524,18 +525,20 @@ def move_on(
         Coulomb's.
     is_held : (N,) bool
         Set for nodes that contacts with the hull moved.
+    is_driven : bool
+        Whether any of the others moves.
 
     Returns
     -------
     float, float
         What drag and damping have taken, joules; and the work of the contacts that are not with
-        the hull, 0 unless there are both.
+        the hull, 0 unless there are both, or these move.
     """
     force, before = np.zeros_like(x), np.zeros_like(x)
     is_held_otherwise = np.zeros(len(x), np.bool_)
     n_contacts = len(contacts.level_m)
     active = np.zeros(n_contacts, np.bool_)
-    is_shared = 0 < n_in_hull < n_contacts
+    is_shared = n_in_hull < n_contacts and (n_in_hull > 0 or is_driven)
     lost_j, other_j = 0.0, 0.0
     kept = np.exp(-0.5 * drag_per_s * step_s)  # half before a step, half after it
     power = _forces(x, v, springs, damping_s, force)

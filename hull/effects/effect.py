@@ -9,13 +9,14 @@ that give the same `make`.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from hybridve.calib.errors import SceneError
+from hybridve.calib.pose import Pose
 from hybridve.hull.cad.scene import Scene, SceneObject
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.silhouettes import Hull, Views
@@ -127,8 +128,31 @@ class Setting:
 
     @property
     def obstacles(self) -> tuple[SceneObject, ...]:
-        """The objects that no effect moves."""
+        """The objects that no effect moves; those that move as a file says at rest."""
         return tuple(one for one in self.scene.objects if one.name not in self.claimed)
+
+    def moves(self, one: SceneObject) -> bool:
+        """Tell whether an effect or a file moves an object from where the scene puts it."""
+        return one.motion is not None or one.name in self.claimed
+
+
+class Course(NamedTuple):
+    """Where an object that moves as a file says is over one step.
+
+    Each is world_from_rest, (3, 4) metres: at the beginning of the step, in its middle, and at its
+    end.
+    """
+
+    begin: Pose
+    middle: Pose
+    end: Pose
+
+    def velocity(self, step_s: float) -> NDArray[np.float64]:
+        """Return what a point at rest, metres, is taken to by how fast it moves: (3, 4), metres/s.
+
+        In the mean over the step, so that it is there at its end.
+        """
+        return np.asarray((self.end - self.begin) / step_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,6 +177,9 @@ class Instant:
         whole pixels, of which the short way from `before` holds few. None where that tells as much.
     recorded_s : float
         From the first of these to the second.
+    courses : mapping of str to Course
+        Of the objects that move as a file says, by name. Where there are any, each step has an
+        instant of its own, of the same hulls.
     """
 
     time_s: float
@@ -162,6 +189,23 @@ class Instant:
     frame: int
     recorded: tuple[Hull, Hull] | None = None
     recorded_s: float = 0.0
+    courses: Mapping[str, Course] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Where an object is in a frame that is not where the scene puts it.
+
+    Attributes
+    ----------
+    vertices_world : (V, 3) float64
+        Metres.
+    world_from_rest : (3, 4) float64 or None
+        Of one that moved rigidly from where the scene puts it; None of one that bends.
+    """
+
+    vertices_world: NDArray[np.float64]
+    world_from_rest: Pose | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +270,18 @@ COMMON = (
         dtype=np.uint32,
     ),
 )
+
+
+#: What those tell besides that meet CAD.
+CAD_WORK = Quantity(
+    "cad_work_j",
+    "J",
+    "estimate",
+    "what CAD that moves as a file says has put into it so far: the work of their contacts",
+)
+
+#: Where those are told of that tell of an object that moves.
+VERTICES = "vertices_m"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,6 +372,22 @@ class Effect(Protocol):
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go on from what `state` gave, to the same values to the bit."""
+        ...
+
+
+@runtime_checkable
+class Onlooker(Protocol):
+    """An `Effect` that tells of objects where they are in a frame, whoever moves them."""
+
+    def see_objects(self, placed: Mapping[str, Placed]) -> None:
+        """Take note of where objects are in the frame whose `values` are asked next.
+
+        Parameters
+        ----------
+        placed : mapping of str to Placed
+            All objects that files or effects move, by name; in a frame in which a file has no pose
+            of one, where it was last. All others are where the scene puts them.
+        """
         ...
 
 

@@ -1,23 +1,28 @@
-"""The hull between two frames, as often as its motion asks for.
+"""What is real, and where CAD is, between two frames: the hull as often as its motion asks for.
 
 A recording has 25 to 60 frames a second, a simulation takes hundreds of steps. Between two frames
 nothing was seen: the hull there is an estimate, from the interpolated outlines that first contact
 uses (`hybridve.hull.contact.between`), or it is held, which is that of the next frame all the way.
+
+Objects that move as a file says go on with every step, whether or not the hull is held: their poses
+between two frames are those of `hybridve.hull.cad.motion`. Where nothing is known of the frame
+before, they have been where the frame has them, as the hull has.
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.hull.cad.motion import Motion
 from hybridve.hull.contact.between import Between
 from hybridve.hull.contact.outline_motion import Outline
 from hybridve.hull.contact.pixel_boxes import box_of, grown_box, intersection, is_empty, slices_of
-from hybridve.hull.effects.effect import Instant
+from hybridve.hull.effects.effect import Course, Instant
 from hybridve.hull.query.silhouettes import Hull, Views
 
 HullMode = Literal["interpolate", "hold"]
@@ -61,8 +66,12 @@ def instants(
     frame: int,
     step_s: float,
     mode: HullMode,
-) -> Iterator[tuple[Instant, int]]:
-    """Yield the instants that lead to a frame, each with the number of equal steps to it.
+    motions: Mapping[str, Motion] | None = None,
+    since: int | None = None,
+) -> Iterator[Sequence[Instant]]:
+    """Yield for each hull that leads to a frame the instants of its equal steps.
+
+    Where no CAD moves, the steps of one hull are the same instant.
 
     Parameters
     ----------
@@ -78,6 +87,10 @@ def instants(
         The longest step.
     mode : "interpolate" or "hold"
         What the hull is on the way.
+    motions : mapping of str to Motion, optional
+        Of the objects that move as a file says, by name; each has a pose of the frame.
+    since : int or None
+        Number of the frame before, if it has a pose of each, too; None where they are held.
     """
     n_hulls, between = 1, None
     if mode == "interpolate" and before is not None:
@@ -87,19 +100,40 @@ def instants(
     for number in range(1, n_hulls + 1):
         fraction = number / n_hulls
         hull = after if between is None or number == n_hulls else between.hull(fraction)
-        yield (
-            Instant(
-                time_s=start_s + fraction * elapsed_s,
-                hull=hull,
-                before=last,
-                elapsed_s=elapsed_s / n_hulls,
-                frame=frame,
-                recorded=None if before is None or n_hulls == 1 else (before, after),
-                recorded_s=elapsed_s,
-            ),
-            pace.n_steps,
+        instant = Instant(
+            time_s=start_s + fraction * elapsed_s,
+            hull=hull,
+            before=last,
+            elapsed_s=elapsed_s / n_hulls,
+            frame=frame,
+            recorded=None if before is None or n_hulls == 1 else (before, after),
+            recorded_s=elapsed_s,
         )
+        steps = [instant] * pace.n_steps
+        if motions:
+            first = (number - 1) * pace.n_steps
+            steps = [
+                replace(
+                    instant,
+                    courses=_courses(motions, since, frame, first + step, n_hulls * pace.n_steps),
+                )
+                for step in range(pace.n_steps)
+            ]
+        yield steps
         last = hull
+
+
+def _courses(
+    motions: Mapping[str, Motion], since: int | None, frame: int, step: int, n_steps: int
+) -> dict[str, Course]:
+    """Return where objects are over one of all equal steps to a frame."""
+    if since is None:
+        return {name: Course(*[motion.poses[frame]] * 3) for name, motion in motions.items()}
+    shares = (step / n_steps, (step + 0.5) / n_steps, (step + 1) / n_steps)
+    return {
+        name: Course(*(motion.between(since, frame, share) for share in shares))
+        for name, motion in motions.items()
+    }
 
 
 def _way(before: Hull, after: Hull) -> tuple[int, Between | None]:

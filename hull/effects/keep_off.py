@@ -4,18 +4,24 @@ Felt are the nodes and the middles of the edges, by the exact signed distance to
 triangle spans between them is not. Of a surface that is not closed there is no inside: the sheet
 keeps off it by half its thickness, and may pass through it where it goes farther in one step.
 
-What the nearest surface of a point is, is taken for flat for one step.
+What the nearest surface of a point is, is taken for flat for one step. Of an object that moves it
+is that at the beginning of the step, which goes along to its end: nothing is on its other side
+then. What slides along a surface is not taken with it.
 
-A point is measured anew only when it may have come near by what it has gone since: distances change
-by no more than that. So what is measured when changes no result.
+A point is measured anew only when it may have come near by what it has gone since, as the object
+sees it: distances change by no more than that. So what is measured when changes no result.
 """
+
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.pose import invert, placed
 from hybridve.hull.cad.distance import SurfaceDistance
 from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.effects.cloth_model import Contacts, no_contacts
+from hybridve.hull.effects.effect import Course
 
 #: Nearer to the surface than this a point has no direction to go, metres.
 _ON_IT_M = 1e-9
@@ -27,7 +33,7 @@ class Obstacle:
     Parameters
     ----------
     thing : SceneObject
-        What stands.
+        What no effect moves.
     edges : (E, 2) int64
         The edges of the sheet, node numbers.
     n_nodes : int
@@ -39,7 +45,9 @@ class Obstacle:
     def __init__(
         self, thing: SceneObject, edges: NDArray[np.int64], n_nodes: int, off_m: float
     ) -> None:
+        self.name = thing.name
         low, high = thing.box_world
+        self._corners = np.array(list(itertools.product(*np.stack([low, high]).T)))
         self._middle = (low + high) / 2.0
         self._half = (high - low) / 2.0
         self._surface = SurfaceDistance(
@@ -60,12 +68,27 @@ class Obstacle:
         """Measure all points anew when next asked: the sheet may be anywhere."""
         self._apart_m[:] = -np.inf
 
-    def contacts(self, x: NDArray[np.float64], margin_m: float) -> Contacts:
+    def contacts(
+        self, x: NDArray[np.float64], margin_m: float, step_s: float, course: Course | None = None
+    ) -> Contacts:
         """Return what nodes (N, 3) and middles of edges are near to.
 
-        `margin_m` is how near counts, beyond how far the sheet keeps off: farther than any goes.
+        Parameters
+        ----------
+        x : (N, 3) float64
+            Metres, at the beginning of the step.
+        margin_m : float
+            How near counts, beyond how far the sheet keeps off: farther than any node goes.
+        step_s : float
+            Seconds.
+        course : Course or None
+            Where the object is over the step; None of one that stands.
         """
         reach_m = self._off_m + margin_m
+        if course is not None:
+            gone_m = placed(self._corners, course.end) - placed(self._corners, course.begin)
+            reach_m += float(np.linalg.norm(gone_m, axis=1).max())
+            x = placed(x, invert(course.begin))
         near = np.zeros(0, np.int64)
         if (
             (x.min(axis=0) <= self._middle + self._half + reach_m)
@@ -82,13 +105,19 @@ class Obstacle:
         length = np.linalg.norm(way, axis=1)
         is_told = (apart_m <= reach_m) & (length > _ON_IT_M)
         near, way = near[is_told], way[is_told] / length[is_told, None]
-        level_m = np.einsum("ij,ij->i", way, nearest[is_told] + self._middle) + self._off_m
+        surface = nearest[is_told] + self._middle
+        rise_m = np.zeros(len(near))
+        if course is not None:
+            way = np.ascontiguousarray(way @ course.end[:, :3].T)
+            begin, surface = placed(surface, course.begin), placed(surface, course.end)
+            rise_m = np.einsum("ij,ij->i", way, surface - begin)
+        level_m = np.einsum("ij,ij->i", way, surface) + self._off_m
         ends = self._ends[near]
         return Contacts(
             np.column_stack([ends, ends[:, :1]]),
             np.where((ends[:, :1] == ends[:, 1:]), [1.0, 0.0, 0.0], [0.5, 0.5, 0.0]),
             way,
             level_m,
-            np.zeros(len(near)),
-            np.zeros(len(near)),
+            rise_m,
+            rise_m / step_s,
         )

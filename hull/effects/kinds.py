@@ -62,7 +62,8 @@ def read_entries(scene: Scene) -> tuple[tuple[Entry, EffectKind], ...]:
     Raises
     ------
     SceneError
-        If a kind or a key is unknown or wrong, two have one name, or two move one object.
+        If a kind or a key is unknown or wrong, two have one name, two move one object, or one moves
+        what a file moves.
     """
     found: list[tuple[Entry, EffectKind]] = []
     for number, raw in enumerate(scene.effects, start=1):
@@ -76,6 +77,7 @@ def read_entries(scene: Scene) -> tuple[tuple[Entry, EffectKind], ...]:
             ) from None
         found.append((Entry(table.name or table.default_name, table, label), kind))
     _refuse_shared([entry for entry, _ in found])
+    _refuse_driven([entry for entry, _ in found], scene)
     return tuple(found)
 
 
@@ -99,6 +101,19 @@ def _refuse_shared(entries: Sequence[Entry]) -> None:
                 "name",
             )
         names[entry.name] = place
+
+
+def _refuse_driven(entries: Sequence[Entry], scene: Scene) -> None:
+    driven = {one.name: one.about.get("motion") for one in scene.objects if one.motion is not None}
+    for entry in entries:
+        for name in entry.table.claimed:
+            if name in driven:
+                key = (driven[name] or {}).get("kind", "poses")
+                raise entry.error(
+                    f"{name!r} moves as its `{key}` says, so that no effect can move it; take out "
+                    "one of the two",
+                    "object",
+                )
 
 
 def make_effects(

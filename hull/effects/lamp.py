@@ -1,11 +1,12 @@
 """A lamp of the scene, and how much of each triangle it reaches: what light and shadow share.
 
 Every triangle is laid into its viewport; from the lamp to each sample goes a ray. It is stopped by
-CAD, once and for all, and by the hull, frame after frame: that is the volume query from the lamp,
-and the ray's way through the silhouettes is exact (`hybridve.hull.query.segments`). Before any ray
-is walked, the pyramid from the lamp to the triangle is cut into slices along its way. Those whose
-rectangle of pixels holds no object pixel in some camera are passed over for all samples, and one
-that holds nothing else in any camera stops the light for all.
+CAD where that is in the frame, asked anew only where some of it has moved, and by the hull: that is
+the volume query from the lamp, and the ray's way through the silhouettes is exact
+(`hybridve.hull.query.segments`). Before any ray is walked, the pyramid from the lamp to the
+triangle is cut into slices along its way. Those whose rectangle of pixels holds no object pixel in
+some camera are passed over for all samples, and one that holds nothing else in any camera stops the
+light for all.
 
 The samples cut the triangle into equal small ones. What is told of the triangle is the mean over
 the small ones of their corners: exact for what is linear between samples. Where the corners of a
@@ -31,15 +32,17 @@ from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.cad.surface_ray import WAITING, first_triangle, tree_of
 from hybridve.hull.cad.surface_tree import SurfaceTree
 from hybridve.hull.effects.effect import (
+    VERTICES,
     Drawn,
     EffectTable,
     Entry,
     Instant,
+    Placed,
     Quantity,
     Setting,
     Told,
 )
-from hybridve.hull.effects.still import still
+from hybridve.hull.effects.still import still, vertices_columns, vertices_of
 from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.bounds import FREE, FULL, OPEN
 from hybridve.hull.query.boxes import ABSTAINS, ACCEPTS, REJECTS, pixel_range, rectangle_vote
@@ -83,7 +86,7 @@ class LampTable(EffectTable):
     cone_deg : float
         How far from that direction it shines, to the rim of its cone.
     objects : tuple of str, or None
-        What is told of; None for all objects that stand. All of them shade.
+        What is told of; None for all objects that no effect moves. All objects shade.
     """
 
     lamp_mm: _Vector
@@ -241,7 +244,7 @@ def _reach_past_cad(
                 if facing <= 0.0 or along < cone_cosine * length_m:
                     continue
                 until = 1.0 - _OWN_M / length_m
-                _, found = first_triangle(lamps[lamp], way, until, tree, waiting)
+                _, found = first_triangle(lamps[lamp], way, until, tree, waiting, ZERO)
                 if found < 0:
                     reached[triangle, sample, lamp] = True
                     gain[triangle, sample, lamp] = facing / (squared * length_m)
@@ -332,7 +335,7 @@ class Lamp:
     entry : Entry
         With a `LampTable`.
     setting : Setting
-        Its obstacles shade; a viewport below 2 counts as 2.
+        Its objects shade; a viewport below 2 counts as 2.
     threads : Threads
         Do the work.
 
@@ -340,32 +343,65 @@ class Lamp:
     ----------
     objects : tuple of SceneObject
         What is told of.
+    moves : bool
+        Whether any of these does.
     first : (K + 1,) int64
         Where the triangles of each object begin among all.
     areas_m2 : (T,) float64
-        Of the triangles.
+        Of the triangles, where they were put last.
+    share_without : (T,) float64
+        The share of each triangle that it reaches where nothing real is, likewise.
 
     Raises
     ------
     SceneError
-        If an object does not exist or does not stand, or the lamp is inside of a solid.
+        If an object does not exist, or the lamp is inside of a solid that stands.
     """
 
     def __init__(self, entry: Entry, setting: Setting, threads: Threads) -> None:
         table: LampTable = entry.table
         self._threads = threads
         self.objects = _objects(entry, setting)
+        self.moves = any(setting.moves(one) for one in self.objects)
         self.first = np.cumsum([0] + [len(one.faces) for one in self.objects])
         lamp_world = np.array(table.lamp_mm) / 1000.0
-        for one in setting.obstacles:
-            _refuse_inside(entry, one, lamp_world)
-        origin_world = setting.views.origin_world
-        self._lamps = lamp_world[None] - origin_world
+        self._scene = setting.scene.objects
+        for one in self._scene:
+            if not setting.moves(one):
+                _refuse_inside(entry, one, lamp_world)
+        self._origin_world = setting.views.origin_world
+        self._lamps = lamp_world[None] - self._origin_world
         if table.radius_mm > 0:
             ball = points_on_ball(table.lamp_points)
             self._lamps = self._lamps + table.radius_mm / 1000.0 * ball
+        self._viewport = max(setting.viewport, 2)
+        self._small = small_triangles(self._viewport)
+        self._direction, self._cosine = np.zeros(3), -1.0
+        if table.direction is not None:
+            self._direction = np.array(table.direction) / np.linalg.norm(table.direction)
+            self._cosine = float(np.cos(np.radians(table.cone_deg)))
+        self._placed: Mapping[str, Placed] = {}
+        self._put()
+
+    def see_objects(self, placed: Mapping[str, Placed]) -> None:
+        """Put objects where they are; what moved nowhere costs nothing."""
+        is_same = self._placed.keys() == placed.keys() and all(
+            np.array_equal(one.vertices_world, self._placed[name].vertices_world)
+            for name, one in placed.items()
+        )
+        if not is_same:
+            self._placed = placed
+            self._put()
+
+    def vertices(self) -> NDArray[np.float64]:
+        """Return where the vertices of its objects are, (V, 3) metres."""
+        return np.concatenate([vertices_of(one, self._placed) for one in self.objects])
+
+    def _put(self) -> None:
+        """Ask which samples the lamp reaches past CAD, where that is now."""
+        origin_world = self._origin_world
         self._corners = np.concatenate(
-            [one.vertices_world[one.faces] - origin_world for one in self.objects]
+            [vertices_of(one, self._placed)[one.faces] - origin_world for one in self.objects]
         )
         sides = np.cross(
             self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0]
@@ -377,30 +413,23 @@ class Lamp:
         owner = np.repeat(np.arange(len(self.objects)), np.diff(self.first))
         normals *= outward[owner][:, None]
         is_two_sided = np.array([not one.is_closed for one in self.objects])[owner]
-        viewport = max(setting.viewport, 2)
-        self._small = small_triangles(viewport)
-        count, n_triangles = n_samples(viewport), len(self._corners)
+        count, n_triangles = n_samples(self._viewport), len(self._corners)
         self._samples = sample_positions(
             np.repeat(self._corners, count, axis=0),
-            np.full(n_triangles * count, viewport, np.int32),
+            np.full(n_triangles * count, self._viewport, np.int32),
             np.tile(np.arange(count, dtype=np.uint32), n_triangles),
         ).reshape(n_triangles, count, 3)
-        shading = [one.vertices_world[one.faces] - origin_world for one in setting.obstacles]
-        direction, cosine = np.zeros(3), -1.0
-        if table.direction is not None:
-            direction = np.array(table.direction) / np.linalg.norm(table.direction)
-            cosine = float(np.cos(np.radians(table.cone_deg)))
+        shading = [vertices_of(one, self._placed)[one.faces] - origin_world for one in self._scene]
         self._reached, self._gain = _reach_past_cad(
             self._samples,
             normals,
             is_two_sided,
             self._lamps,
-            direction,
-            cosine,
+            self._direction,
+            self._cosine,
             tree_of(np.concatenate(shading)),
         )
         lit = self._reached.mean(axis=2)[:, self._small].mean(axis=(1, 2))
-        #: The share of each triangle that it reaches where nothing real is.
         self.share_without = np.asarray(lit, np.float64)
 
     def reach(self, hull: Hull) -> Lit:
@@ -440,31 +469,25 @@ class Lamp:
         return np.add.reduceat(shares * self.areas_m2, self.first[:-1])
 
     def drawn(self, *cell_columns: str) -> Drawn:
-        """Return the objects as one mesh that stands, with numbers for its triangles."""
+        """Return the objects as one mesh, with numbers for its triangles."""
         before = np.cumsum([0] + [len(one.vertices_world) for one in self.objects])
-        faces = [one.faces + start for one, start in zip(self.objects, before[:-1], strict=True)]
-        return Drawn(
-            "",
-            np.concatenate([one.vertices_world for one in self.objects]),
-            np.concatenate(faces).astype(np.int32),
-            cell_columns,
-        )
+        faces = np.concatenate(
+            [one.faces + start for one, start in zip(self.objects, before[:-1], strict=True)]
+        ).astype(np.int32)
+        if self.moves:
+            return Drawn(VERTICES, None, faces, cell_columns)
+        return Drawn("", self.vertices(), faces, cell_columns)
 
 
 def _objects(entry: Entry, setting: Setting) -> tuple[SceneObject, ...]:
     table: LampTable = entry.table
     if table.objects is None:
         if not setting.obstacles:
-            raise entry.error("no object stands that it could shine on: effects move all of them")
+            raise entry.error("effects move all objects; name in `objects` on which it shines")
         return setting.obstacles
-    found = []
+    found: list[SceneObject] = []
     for name in table.objects:
         one = setting.object_of(entry, name, "objects")
-        if name in setting.claimed:
-            raise entry.error(
-                f"{name!r} is moved by another effect; a lamp shines on objects that stand",
-                "objects",
-            )
         if one in found:
             raise entry.error(f"{name!r} is named twice", "objects")
         found.append(one)
@@ -491,6 +514,7 @@ def columns_of(lamp: Lamp) -> tuple[Quantity, ...]:
     """Return the columns that light and shadow share."""
     count, n_objects = len(lamp.areas_m2), len(lamp.objects)
     return (
+        *vertices_columns(len(lamp.vertices()) if lamp.moves else 0),
         Quantity(
             "share_lit",
             "1",
@@ -526,6 +550,7 @@ def values_of(lamp: Lamp, lit: Lit) -> dict[str, NDArray[Any]]:
     lit_m2 = lamp.by_object(lit.share)
     return {
         **still(),
+        **({VERTICES: lamp.vertices()} if lamp.moves else {}),
         "share_lit": lit.share.astype(np.float32),
         "share_unsure": lit.share_unsure.astype(np.float32),
         "lit_m2": lit_m2,
@@ -545,7 +570,7 @@ def about_of(lamp: Lamp, entry: Entry) -> dict[str, Any]:
 class Lamps(ABC):
     """The lamps of all entries of a kind; an `Effect` but for what is told and how it is called.
 
-    The hull is looked at once a frame: nothing goes on in between.
+    And an `Onlooker`. The hull is looked at once a frame: nothing goes on in between.
     """
 
     def __init__(
@@ -569,6 +594,11 @@ class Lamps(ABC):
     def advance(self, instant: Instant, step_s: float) -> None:  # noqa: B027  # light takes no time
         """Do nothing."""
 
+    def see_objects(self, placed: Mapping[str, Placed]) -> None:
+        """Take note of where objects are in the frame that is told next."""
+        for lamp in self.lamps.values():
+            lamp.see_objects(placed)
+
     def values(self, hull: Hull | None) -> Mapping[str, Mapping[str, NDArray[Any]]]:
         """Return by entry and column what the lamps reach in a frame; NaN where it has no hull."""
         if hull is None:
@@ -576,6 +606,7 @@ class Lamps(ABC):
                 name: {
                     **still(),
                     **{one.name: np.full(one.shape, np.nan, one.dtype) for one in told.columns},
+                    **({VERTICES: self.lamps[name].vertices()} if self.lamps[name].moves else {}),
                 }
                 for name, told in self.told.items()
             }

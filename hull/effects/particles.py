@@ -3,10 +3,12 @@
 Between contacts a particle follows the exact solution of weight and drag, v' = a - v / drag_s: a
 step's length changes nothing. What it goes through in a step is the chord of that path (off by a
 hundredth of a millimetre at 5 ms), which is walked through the hull's silhouettes to rounding
-(`hybridve.hull.query.segments`) and through all other CAD: nothing is jumped over. At the point of
+(`hybridve.hull.query.segments`) and through all other CAD (`hybridve.hull.effects.cad_ways`), which
+may move meanwhile: nothing is jumped over. At the point of
 entry the particle is thrown back at N_hull, the normal of the silhouette that ends the hull there,
 with restitution and friction, relative to the speed at which the hull's surface came there: its way
-along N_hull since the instant before. The rest of the step follows. What lands and does not bounce
+along N_hull since the instant before. CAD throws it back at its own normal, relative to its own
+speed. The rest of the step follows. What lands and does not bounce
 slides: it gives way along N_hull over the steps of a silhouette's pixels.
 
 A particle that the hull has moved over is put out of it along one of fourteen ways: the one along
@@ -29,9 +31,10 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from hybridve.hull.agreement.sight import sight_of
-from hybridve.hull.cad.surface_ray import WAITING, first_triangle, tree_of
-from hybridve.hull.cad.surface_tree import SurfaceTree
+from hybridve.hull.cad.surface_ray import WAITING
+from hybridve.hull.effects.cad_ways import Cad, CadWays, cad_normal, cad_speed, carry, first_cad
 from hybridve.hull.effects.effect import (
+    CAD_WORK,
     GRAVITY_M_S2,
     Drawn,
     EffectKind,
@@ -189,8 +192,8 @@ class _Swarm:
         Whether there is one.
     n_contacts : (N,) uint32
         With the hull, of the particle that is there.
-    work_j : (N,) float64
-        What the hull has done to all that were in this place.
+    work_j, cad_work_j : (N,) float64
+        What the hull, and CAD that moves, has done to all that were in this place.
     depth_m : (N,) float64
         The deepest in the hull after any step since the frame before.
     n_out, n_lost : (1,) int64
@@ -207,6 +210,7 @@ class _Swarm:
     is_alive: NDArray[np.bool_]
     n_contacts: NDArray[np.uint32]
     work_j: NDArray[np.float64]
+    cad_work_j: NDArray[np.float64]
     depth_m: NDArray[np.float64]
     n_out: NDArray[np.int64]
     n_lost: NDArray[np.int64]
@@ -223,6 +227,7 @@ class _Swarm:
             np.zeros(count),
             np.zeros(count, np.bool_),
             np.zeros(count, np.uint32),
+            np.zeros(count),
             np.zeros(count),
             np.zeros(count),
             np.zeros(1, np.int64),
@@ -256,9 +261,9 @@ def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 @inlined
-def _slide(vector: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
-    """Take from a vector what leads into the surface with an outward normal."""
-    into = min(_dot(vector, normal), 0.0)
+def _slide(vector: NDArray[np.float64], normal: NDArray[np.float64], least: float) -> None:
+    """Take from a vector what leads into the surface with an outward normal, which goes `least`."""
+    into = min(_dot(vector, normal) - least, 0.0)
     for axis in range(3):
         vector[axis] -= into * normal[axis]
 
@@ -350,14 +355,17 @@ def _put_out(
     frame: Frame,
     before: Frame,
     elapsed_s: float,
-    tree: SurfaceTree,
+    cad: Cad,
+    share: float,
     least_m: float,
     room: NDArray[np.float64],
+    cad_room: NDArray[np.float64],
     waiting: NDArray[np.int64],
 ) -> bool:
     """Move a particle out of the hull, and give it the surface's speed; tell whether it could.
 
-    `elapsed_s` is 0 where nothing is known of the hull before.
+    `elapsed_s` is 0 where nothing is known of the hull before; CAD is where it is at a share of the
+    step.
     """
     begin, step = room[0], room[1]
     least = least_m / _OUT_M
@@ -374,7 +382,7 @@ def _put_out(
             continue
         for axis in range(3):
             place[axis] = point[axis] + out_m * ways[number, axis]
-        blocked, _ = first_triangle(point, way, out_m / _OUT_M, tree, waiting)
+        blocked, _, _ = first_cad(point, way, out_m / _OUT_M, cad, share, share, cad_room, waiting)
         if blocked <= 1.0 or _is_in(place, frame):
             continue
         moved_m = np.inf
@@ -431,13 +439,14 @@ def _advance(
     is_alive: NDArray[np.bool_],
     n_contacts: NDArray[np.uint32],
     work_j: NDArray[np.float64],
+    cad_work_j: NDArray[np.float64],
     depth_m: NDArray[np.float64],
     material: _Material,
     ways: NDArray[np.float64],
     frame: Frame,
     before: Frame,
     elapsed_s: float,
-    tree: SurfaceTree,
+    cad: Cad,
     least_m: float,
 ) -> None:
     """Move particles `first` to `stop` by as long as each flies; see this file's head.
@@ -446,7 +455,8 @@ def _advance(
     """
     room = np.zeros((2, len(frame.matrices), 3))
     begin, step = room[0], room[1]
-    waiting = np.zeros(WAITING, np.int64)
+    waiting, cad_room = np.zeros(WAITING, np.int64), np.zeros((2, 3))
+    cad_moves = len(cad.root) > 1
     way, normal, rest, other = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     pull, rate, mass_kg = material.acceleration, material.drag_rate, material.mass_kg
     for i in range(first, stop):
@@ -463,9 +473,11 @@ def _advance(
                 frame,
                 before,
                 elapsed_s,
-                tree,
+                cad,
+                1.0 - left_s / cad.step_s,
                 least_m,
                 room,
+                cad_room,
                 waiting,
             ):
                 is_alive[i] = False
@@ -473,20 +485,26 @@ def _advance(
             energy = 0.5 * _dot(velocity, velocity) - pull * position[2] - energy
             work_j[i] += mass_kg * energy
             n_contacts[i] += 1
-        is_resting, n_rests = False, 0
+        is_resting, n_rests, rest_m_s, is_stuck = False, 0, 0.0, True
+        thing, share = -1, 0.0
         for _ in range(_MOST_CONTACTS):
             kept, by_speed, by_pull = _flight(left_s, rate)
             for axis in range(3):
                 way[axis] = by_speed * velocity[axis]
             way[2] += by_pull * pull
             if is_resting:
-                _slide(way, rest)
+                _slide(way, rest, rest_m_s * left_s)
             length_m = np.sqrt(_dot(way, way))
             at, camera, triangle = np.inf, -1, -1
+            thing = -1
             if length_m > 0.0:
                 place_segment(position, way, frame, begin, step)
                 at, camera = first_entry(begin, step, least_m / length_m, frame)
-                at_cad, triangle = first_triangle(position, way, min(at, 1.0), tree, waiting)
+            if length_m > 0.0 or cad_moves:
+                share = 1.0 - left_s / cad.step_s
+                at_cad, triangle, thing = first_cad(
+                    position, way, min(at, 1.0), cad, share, 1.0, cad_room, waiting
+                )
                 if triangle >= 0:
                     at = at_cad
             used_s = left_s * min(at, 1.0)
@@ -495,24 +513,16 @@ def _advance(
                 velocity[axis] *= kept
             velocity[2] += by_speed * pull
             if is_resting:
-                _slide(velocity, rest)
+                _slide(velocity, rest, rest_m_s)
             if at > 1.0:
                 for axis in range(3):
                     position[axis] += way[axis]
+                is_stuck = False
                 break
             left_s -= used_s
+            share = 1.0 - left_s / cad.step_s
             if triangle >= 0:
-                solid = tree.solid[triangle]
-                for axis in range(3):
-                    j, k = (axis + 1) % 3, (axis + 2) % 3
-                    normal[axis] = (solid[3 + j] - solid[j]) * (solid[6 + k] - solid[k]) - (
-                        solid[3 + k] - solid[k]
-                    ) * (solid[6 + j] - solid[j])
-                scale = np.sqrt(_dot(normal, normal))
-                if _dot(normal, way) > 0.0:
-                    scale = -scale
-                for axis in range(3):
-                    normal[axis] /= scale
+                cad_normal(triangle, thing, share, cad, cad_room, normal)
             else:
                 for axis in range(3):
                     other[axis] = position[axis] + at * way[axis]
@@ -522,11 +532,16 @@ def _advance(
             surface_m_s = 0.0
             if triangle < 0 and elapsed_s > 0.0:
                 surface_m_s = _surface_speed(other, normal, before, elapsed_s, least_m, room)
-            steepness = abs(_dot(normal, way)) / length_m
-            back = _MARGIN_M / (max(steepness, 1e-3) * length_m)
-            at = max(at - back, 0.0)
-            for axis in range(3):
-                position[axis] += at * way[axis]
+            if thing > 0:  # it comes from any side: the particle is put beside it
+                for axis in range(3):
+                    position[axis] += at * way[axis] + _MARGIN_M * normal[axis]
+                surface_m_s = cad_speed(position, normal, thing, share, cad)
+            else:
+                steepness = abs(_dot(normal, way)) / length_m
+                back = _MARGIN_M / (max(steepness, 1e-3) * length_m)
+                at = max(at - back, 0.0)
+                for axis in range(3):
+                    position[axis] += at * way[axis]
             energy = 0.5 * _dot(velocity, velocity) - pull * position[2]
             towards = _dot(velocity, normal) - surface_m_s
             # What gravity alone gives back to it within a step is no bounce.
@@ -543,21 +558,29 @@ def _advance(
                         other[axis] += (hop + _SKIN_M / _HOP_M) * way[axis]
                     for axis in range(3):
                         way[axis] = other[axis] - position[axis]
-                    blocked, _ = first_triangle(position, way, 1.0, tree, waiting)
+                    blocked, _, _ = first_cad(
+                        position, way, 1.0, cad, share, share, cad_room, waiting
+                    )
                     if blocked > 1.0 and not _is_in(other, frame):
                         for axis in range(3):
                             position[axis] = other[axis]
             for axis in range(3):
                 rest[axis] = normal[axis]
+            rest_m_s = surface_m_s if thing > 0 else 0.0
             restitution = 0.0 if is_resting else material.restitution
             _throw_back(velocity, normal, surface_m_s, restitution, material.friction)
             if triangle < 0:
                 energy = 0.5 * _dot(velocity, velocity) - pull * position[2] - energy
                 work_j[i] += mass_kg * energy
                 n_contacts[i] += 1
+            elif thing > 0:
+                energy = 0.5 * _dot(velocity, velocity) - pull * position[2] - energy
+                cad_work_j[i] += mass_kg * energy
             n_rests += is_resting
             if n_rests == _MOST_RESTS:
                 break
+        if is_stuck and thing > 0:  # what lies on CAD goes with it all the same
+            carry(position, thing, share, cad)
         if _is_in(position, frame):
             depth_m[i] = max(depth_m[i], _depth(position, ways, frame, least_m, room))
 
@@ -580,6 +603,12 @@ class _Source:
                 raise entry.error(
                     f"{one.name!r} is moved by another effect; particles come out of objects that "
                     "stand",
+                    "object",
+                )
+            if one.motion is not None:
+                raise entry.error(
+                    f"{one.name!r} moves as a file says; particles come out of objects that stand, "
+                    "or of source_mm",
                     "object",
                 )
             if sight_of(setting.views, one.vertices_world, one.faces).is_not_seen:
@@ -686,7 +715,7 @@ def _n_seen(views: Views, points_world: NDArray[np.float64]) -> NDArray[np.int64
 class _Cloud:
     """The particles of one entry."""
 
-    def __init__(self, entry: Entry, setting: Setting, tree: SurfaceTree, threads: Threads) -> None:
+    def __init__(self, entry: Entry, setting: Setting, cad: CadWays, threads: Threads) -> None:
         table: ParticlesTable = entry.table
         style = _STYLES[table.style]
         self._name = entry.name
@@ -694,7 +723,7 @@ class _Cloud:
             key: value if (given := getattr(table, key)) is None else given
             for key, value in style._asdict().items()
         }
-        self._table, self._tree, self._threads = table, tree, threads
+        self._table, self._cad, self._threads = table, cad, threads
         self._origin_world = setting.views.origin_world
         self._lifetime_s = settings["lifetime_s"]
         self._material = _Material(
@@ -727,7 +756,7 @@ class _Cloud:
         time_s = float(swarm.time_s[0]) + step_s
         self._let_out(time_s, flight_s)
         swarm.time_s[0] = time_s
-        self._move(instant, flight_s)
+        self._move(instant, flight_s, step_s)
         swarm.age_s += flight_s
         swarm.is_alive &= swarm.age_s < self._lifetime_s
         if not (np.isfinite(swarm.position).all() and np.isfinite(swarm.velocity).all()):
@@ -754,8 +783,9 @@ class _Cloud:
         born_s = 0.0 if table.rate_per_s is None else number / table.rate_per_s
         flight_s[place] = until_s - born_s
 
-    def _move(self, instant: Instant, flight_s: NDArray[np.float64]) -> None:
+    def _move(self, instant: Instant, flight_s: NDArray[np.float64], step_s: float) -> None:
         swarm, hull = self.swarm, instant.hull
+        cad = self._cad.over(instant.courses, step_s)
         frame = hull.frame
         before, elapsed_s = frame, 0.0
         if instant.before is not None and instant.elapsed_s > 0:
@@ -777,13 +807,14 @@ class _Cloud:
                         swarm.is_alive,
                         swarm.n_contacts,
                         swarm.work_j,
+                        swarm.cad_work_j,
                         swarm.depth_m,
                         self._material,
                         _WAYS,
                         frame,
                         before,
                         elapsed_s,
-                        self._tree,
+                        cad,
                         least_m,
                     ),
                 )
@@ -810,6 +841,7 @@ class _Cloud:
             "n_deflected": swarm.n_contacts.copy(),
             "n_alive": np.asarray(alive.sum(), np.uint32),
             "n_lost": np.asarray(swarm.n_lost[0], np.uint32),
+            "cad_work_j": np.asarray(swarm.cad_work_j.sum()),
         }
         swarm.n_told[0] = n_contacts
         swarm.depth_m[:] = 0.0
@@ -846,6 +878,7 @@ def _columns(count: int) -> tuple[Quantity, ...]:
             "how many real things have left no way out so far; they are gone",
             dtype=np.uint32,
         ),
+        CAD_WORK,
     )
 
 
@@ -855,10 +888,8 @@ class Particles:
     def __init__(
         self, entries: Sequence[Entry], setting: Setting, threads: Threads | None = None
     ) -> None:
-        corners = [one.vertices_world[one.faces] for one in setting.obstacles]
-        tree = tree_of(np.concatenate([np.zeros((0, 3, 3)), *corners]) - setting.views.origin_world)
-        threads = threads or Threads()
-        self._clouds = {entry.name: _Cloud(entry, setting, tree, threads) for entry in entries}
+        cad, threads = CadWays(setting), threads or Threads()
+        self._clouds = {entry.name: _Cloud(entry, setting, cad, threads) for entry in entries}
         self.told: Mapping[str, Told] = {name: cloud.told for name, cloud in self._clouds.items()}
 
     def advance(self, instant: Instant, step_s: float) -> None:

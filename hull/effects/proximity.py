@@ -26,16 +26,18 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from hybridve.hull.cad.surface_tree import SurfaceTree, closest_on_surface, make_tree
 from hybridve.hull.contact.clearance import Clearance, ClearanceMeter
 from hybridve.hull.effects.effect import (
+    VERTICES,
     Drawn,
     EffectKind,
     EffectTable,
     Entry,
     Instant,
+    Placed,
     Quantity,
     Setting,
     Told,
 )
-from hybridve.hull.effects.still import still
+from hybridve.hull.effects.still import still, vertices_columns, vertices_of
 from hybridve.hull.query.points import are_inside
 from hybridve.hull.query.silhouettes import Hull
 
@@ -120,22 +122,14 @@ class _Watch:
 
     def __init__(self, entry: Entry, setting: Setting) -> None:
         table: ProximityTable = entry.table
-        one = setting.object_of(entry, table.object)
-        if one.name in setting.claimed:
-            raise entry.error(
-                f"{one.name!r} is moved by another effect; proximity is that to objects that stand",
-                "object",
-            )
+        self._object = one = setting.object_of(entry, table.object)
+        self._moves = setting.moves(one)
         self._falloff = table.falloff
         self._zones_m = np.array(table.zones_mm) / 1000.0
         self._cell_m = table.resolution_mm / 1000.0
-        self._meter = ClearanceMeter(
-            one.vertices_world,
-            one.faces,
-            is_closed=one.is_closed,
-            tolerance_m=table.tolerance_mm / 1000.0,
-            solid_faces=one.solid_faces,
-        )
+        self._tolerance_m = table.tolerance_mm / 1000.0
+        self._vertices = one.vertices_world
+        self._meter = self._meter_at_rest = self._meter_of(one.vertices_world)
         self._middles = one.vertices_world[one.faces].mean(axis=1)
         count, n_zones = len(one.faces), len(self._zones_m)
         n_exposed = count if self._falloff is not None else 0
@@ -148,10 +142,37 @@ class _Watch:
             "was_in": np.zeros((n_zones, 2), np.bool_),
             "strength": np.zeros((n_exposed, 2)),
         }
-        drawn = Drawn("", one.vertices_world, one.faces, ("exposure_s",) if n_exposed else ())
-        self.told = Told(
-            _columns(n_zones, n_exposed), drawn, about=entry.table.model_dump(mode="json")
+        cell_columns = ("exposure_s",) if n_exposed else ()
+        drawn = Drawn("", one.vertices_world, one.faces, cell_columns)
+        if self._moves:
+            drawn = Drawn(VERTICES, None, one.faces, cell_columns)
+        columns = (
+            *vertices_columns(len(one.vertices_world) if self._moves else 0),
+            *_columns(n_zones, n_exposed),
         )
+        self.told = Told(columns, drawn, about=entry.table.model_dump(mode="json"))
+
+    def _meter_of(self, vertices_world: NDArray[np.float64]) -> ClearanceMeter:
+        one = self._object
+        return ClearanceMeter(
+            vertices_world,
+            one.faces,
+            is_closed=one.is_closed,
+            tolerance_m=self._tolerance_m,
+            solid_faces=one.solid_faces,
+        )
+
+    def see_objects(self, placed: Mapping[str, Placed]) -> None:
+        """Take note of where the object is; what is known of its distances goes with it."""
+        there = placed.get(self._object.name)
+        if there is None:
+            return
+        self._vertices = vertices_of(self._object, placed)
+        self._middles = self._vertices[self._object.faces].mean(axis=1)
+        if there.world_from_rest is None:
+            self._meter = self._meter_of(self._vertices)
+        else:
+            self._meter = self._meter_at_rest.at(there.world_from_rest)
 
     def look(self, hull: Hull, elapsed_s: float, is_known: bool) -> dict[str, NDArray[Any]]:
         """Take in a frame, so long after what was known before; return what is told then."""
@@ -188,6 +209,7 @@ class _Watch:
     ) -> dict[str, NDArray[Any]]:
         state = self.state
         told: dict[str, NDArray[Any]] = {
+            **({VERTICES: self._vertices} if self._moves else {}),
             "clearance_m": bounds_m,
             "is_in_zone": is_in.astype(np.uint8),
             "time_in_zone_s": state["time_in_zone_s"].copy(),
@@ -291,7 +313,10 @@ def _columns(n_zones: int, n_exposed: int) -> tuple[Quantity, ...]:
 
 
 class Proximity:
-    """All that is watched in a scene; an `Effect`. The hull is looked at once a frame."""
+    """All that is watched in a scene; an `Effect` and `Onlooker`.
+
+    The hull is looked at once a frame.
+    """
 
     def __init__(self, entries: Sequence[Entry], setting: Setting) -> None:
         self._watches = {entry.name: _Watch(entry, setting) for entry in entries}
@@ -304,6 +329,11 @@ class Proximity:
         self._gone[0] += step_s
         if instant.before is None:
             self._gone[1] = 1.0
+
+    def see_objects(self, placed: Mapping[str, Placed]) -> None:
+        """Take note of where objects are in the frame that is told next."""
+        for one in self._watches.values():
+            one.see_objects(placed)
 
     def values(self, hull: Hull | None) -> Mapping[str, Mapping[str, NDArray[Any]]]:
         """Return by entry and column what stands at the end of a frame."""

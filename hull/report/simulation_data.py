@@ -125,7 +125,9 @@ class SimulationHeader:
     local_origin_m : tuple of 3 floats
         Places in the file are metres about this point of the world.
     standing : tuple of (name, vertices (V, 3), faces (T, 3))
-        The CAD that no effect moves, metres in the world.
+        The CAD that nothing moves, metres in the world.
+    moving : tuple of (name, vertices (V, 3), faces (T, 3))
+        The CAD that moves as files say, metres in the frame of its mesh.
     """
 
     run: Run
@@ -136,6 +138,7 @@ class SimulationHeader:
     groups: tuple[Group, ...]
     local_origin_m: tuple[float, float, float]
     standing: tuple[tuple[str, NDArray[np.float64], NDArray[np.int32]], ...] = ()
+    moving: tuple[tuple[str, NDArray[np.float64], NDArray[np.int32]], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,6 +163,9 @@ class SimulatedFrame:
         What the frame says of the cameras.
     blew_up : str
         Of the last frame of a simulation that was stopped, why; else empty.
+    poses : dict of (3, 4) float64
+        Where the CAD was that moves as files say, by name: world from the frame of its mesh. What
+        has no pose in the frame is left out.
     """
 
     index: int
@@ -171,6 +177,7 @@ class SimulatedFrame:
     values: Mapping[str, Mapping[str, NDArray[Any]]]
     outlines: FrameOutlines
     blew_up: str = ""
+    poses: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,7 +231,10 @@ class StoredSimulation:
     agreement : SessionAgreement
         What the cameras say about each other.
     standing : tuple of (name, vertices, faces)
-        The CAD that no effect moves, in the world.
+        The CAD that nothing moves, in the world.
+    moving : tuple of (name, vertices, faces, poses (F, 3, 4))
+        The CAD that moves as files say, in the frame of its mesh, and where that was, NaN where it
+        is not known.
     """
 
     path: Path
@@ -240,3 +250,4 @@ class StoredSimulation:
     stopped: str = ""
     agreement: SessionAgreement = field(default_factory=SessionAgreement)
     standing: tuple[tuple[str, NDArray[np.float64], NDArray[np.int32]], ...] = ()
+    moving: tuple[tuple[str, NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]], ...] = ()

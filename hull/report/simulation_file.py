@@ -8,7 +8,8 @@ goes on from its last frame; they become the file once the last frame is done.
     /hybridve/settings/   configuration (JSON), rig (JSON), agreement (JSON), local_origin_m
     /hybridve/frames/     index, time_s, valid, reason, n_steps, n_hulls, stage_s/...
     /hybridve/effects/E/  a dataset for each variable, a row a frame; constants below constants/
-    /hybridve/standing/O/ vertices_m, faces: the CAD that no effect moves
+    /hybridve/standing/O/ vertices_m, faces: the CAD that nothing moves
+    /hybridve/moving/O/   vertices_m, faces, world_from_mesh: the CAD that moves as files say
     /VTKHDF               the same as ParaView and VTK read it
 """
 
@@ -201,6 +202,10 @@ class SimulationWriter:
                         f"{variable.shape}"
                     )
                 columns[_key(group, variable)] = variable.about(values, origin_m)
+        nowhere = np.full((3, 4), np.nan)
+        for name, _, _ in self._header.moving:
+            poses = np.stack([frame.poses.get(name, nowhere) for frame in frames])
+            columns[f"moving/{name}"] = _PLACE.about(poses, origin_m)
         part = self._parts / f"{self.n_done:09d}.npz"
         with appearing(part) as partial, partial.open("wb") as file:
             np.savez(file, **columns)  # type: ignore[arg-type]  # the stub takes names for options
@@ -278,6 +283,11 @@ class SimulationWriter:
             standing = file.create_group(f"hybridve/standing/{name}")
             store(standing, _VERTICES, vertices_world - origin_m)
             store(standing, _FACES, faces)
+        for name, vertices_mesh, faces in header.moving:
+            moving = file.create_group(f"hybridve/moving/{name}")
+            store(moving, _VERTICES, vertices_mesh)
+            store(moving, _FACES, faces)
+            self._store_rows(moving, _PLACE, f"moving/{name}")
         self._add_vtkhdf(file)
 
     def _write_group(self, stored: h5py.Group, group: Group, origin_m: NDArray[np.float64]) -> None:
@@ -318,7 +328,9 @@ class SimulationWriter:
         n_frames = len(file["hybridve/frames/index"])
         groups = [group for group in self._header.groups if group.shown is not None]
         standing = list(file.get("hybridve/standing", {}).items())
-        labels = labels_of([group.name for group in groups] + [name for name, _ in standing])
+        moving = list(file.get("hybridve/moving", {}).items())
+        beside = [*standing, *moving]
+        labels = labels_of([group.name for group in groups] + [name for name, _ in beside])
         for label, group in zip(labels, groups, strict=False):
             stored = file[f"hybridve/effects/{group.name}"]
             if group.shown is None:
@@ -334,14 +346,9 @@ class SimulationWriter:
                     vertices_at,
                     np.arange(n_frames) * bool(group.shown.column),
                 )
-        for label, (name, mesh) in zip(labels[len(groups) :], standing, strict=True):
-            vertices_m = mesh[_VERTICES.name][:]
-            add_surface(
-                collection.block(label, name),
-                mesh[_FACES.name][:],
-                lambda _, vertices_m=vertices_m: vertices_m,  # type: ignore[misc]
-                np.zeros(n_frames, np.int64),
-            )
+        for label, (name, mesh) in zip(labels[len(groups) :], beside, strict=True):
+            vertices_at, shown = _places_of_cad(mesh, n_frames)
+            add_surface(collection.block(label, name), mesh[_FACES.name][:], vertices_at, shown)
 
     def __enter__(self) -> Self:
         return self
@@ -365,6 +372,14 @@ _ORIGIN = Described(
 )
 _VERTICES = Described("vertices_m", "m", "exact", "vertices of the mesh")
 _FACES = Described("faces", "1", "exact", "vertex numbers of each triangle")
+_PLACE = Variable(
+    "world_from_mesh",
+    "m",
+    "exact",
+    "rotation and place of the mesh, as its file says; NaN where that has no pose",
+    (3, 4),
+    is_place=True,
+)
 _BLEW_UP = "frame/blew_up"
 
 
@@ -386,6 +401,21 @@ def _places(stored: h5py.Group, shown: Shown) -> Callable[[int], NDArray[np.floa
         return lambda row: values[row]
     vertices = shown.vertices
     return lambda row: placed(vertices, values[row])
+
+
+def _places_of_cad(
+    mesh: h5py.Group, n_frames: int
+) -> tuple[Callable[[int], NDArray[np.floating]], NDArray[np.int64]]:
+    """Return what gives the vertices of CAD in a frame, and as which frame (F,) each shows it.
+
+    Metres about the local origin; -1 for a frame in which it has no place.
+    """
+    vertices_m = mesh[_VERTICES.name][:]
+    if _PLACE.name not in mesh:
+        return lambda _: vertices_m, np.zeros(n_frames, np.int64)
+    poses = mesh[_PLACE.name][:]
+    is_known = np.isfinite(poses).all(axis=(1, 2))
+    return lambda row: placed(vertices_m, poses[row]), np.where(is_known, np.arange(n_frames), -1)
 
 
 def _shown_points(places_m: NDArray[np.floating]) -> FramePoints:
@@ -427,6 +457,15 @@ def read_simulation(path: Path) -> StoredSimulation:
             standing=tuple(
                 (name, mesh["vertices_m"][:] + origin_m, mesh["faces"][:])
                 for name, mesh in file.get("hybridve/standing", {}).items()
+            ),
+            moving=tuple(
+                (
+                    name,
+                    mesh["vertices_m"][:],
+                    mesh["faces"][:],
+                    _in_world(mesh[_PLACE.name], origin_m),
+                )
+                for name, mesh in file.get("hybridve/moving", {}).items()
             ),
         )
 

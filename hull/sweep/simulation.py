@@ -187,7 +187,7 @@ def _run(
         name: told.drawn for effect, _ in simulation.effects for name, told in effect.told.items()
     }
     energy_j = _sums(found, "kinetic_j") + _sums(found, "potential_j")
-    given_j = energy_j[0] + _sums(found, "hull_work_j")
+    given_j = energy_j[0] + _sums(found, "hull_work_j") + _sums(found, "cad_work_j")
     seconds = [
         one.stage_s["between"]
         + sum(float(one.values[names[0]]["step_s"]) for _, names in simulation.effects)
@@ -207,9 +207,9 @@ def _run(
 
 
 def _sums(frames: Sequence[SimulatedFrame], name: str) -> NDArray[np.float64]:
-    """Return the sum over all effects of one of their numbers, frame by frame."""
+    """Return the sum over all effects that tell it of one of their numbers, frame by frame."""
     return np.array(
-        [sum(float(values[name]) for values in frame.values.values()) for frame in frames]
+        [sum(float(values.get(name, 0.0)) for values in frame.values.values()) for frame in frames]
     )
 
 
