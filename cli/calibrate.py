@@ -95,8 +95,8 @@ class BoxMillimetres(click.ParamType["Box"]):
 )
 @click.option(
     "--rig-unit",
-    type=click.Choice(["m", "cm", "mm", "in", "ft"]),
-    help="Unit of RIG's lengths, where its format has none.",
+    type=click.Choice(["m", "cm", "mm", "in", "ft", "squares"]),
+    help="Unit of RIG's lengths, where its format has none; squares are those of SESSION's target.",
 )
 @click.option("--no-page", is_flag=True, help="Write no certificate.html, which takes seconds.")
 @options.overwrite_option
@@ -166,10 +166,13 @@ def _check(
     from hybridve.hull.capture.rig import board_sizes
     from hybridve.hull.capture.rig_check import check_session
 
-    names = [camera.name for camera in session.cameras]
-    sizes_px = set(board_sizes(session).values())
-    image_size = sizes_px.pop() if len(sizes_px) == 1 else None
-    rig = read_any_rig(source, unit=unit, image_size=image_size, names=names)
+    rig = read_any_rig(
+        source,
+        unit=unit,
+        square_m=None if session.target is None else session.target.unit_m,
+        image_sizes=board_sizes(session),
+        names=[camera.name for camera in session.cameras],
+    )
     check = check_session(session, rig, terminal.stage)
     if as_json:
         click.echo(json.dumps(to_json({"rig": str(source), **asdict(check)})))
@@ -199,7 +202,6 @@ def _calibrate(
     with_page: bool,
     as_json: bool,
 ) -> None:
-    from hybridve.calib.formats.colmap import write_colmap_model
     from hybridve.calib.formats.rig_json import write_rig
     from hybridve.calib.judging.certificate import certify, working_volume
     from hybridve.calib.plain import to_json
@@ -217,14 +219,32 @@ def _calibrate(
         _write_certificate(
             folder, session, calibration, certificate, volume, max_error_m, with_page
         )
-    write_colmap_model(folder / "colmap", rig)
+    no_colmap = _write_colmap(folder / "colmap", rig)
     write_rig(path, rig)
     if as_json:
-        click.echo(json.dumps(to_json(_numbers(path, rig, certificate))))
+        numbers = _numbers(path, rig, certificate) | {"no_colmap_model": no_colmap}
+        click.echo(json.dumps(to_json(numbers)))
     else:
         _print(path, rig, certificate)
+        if no_colmap is not None:
+            click.echo(f"  {no_colmap}")
     if max_error_m is not None:
         _gate(certificate, max_error_m)
+
+
+def _write_colmap(folder: Path, rig: "Rig") -> str | None:
+    """Write the COLMAP model of a rig; where there can be none, say why."""
+    from hybridve.calib.formats import colmap
+
+    reasons = ((camera.name, colmap.refusal(camera)) for camera in rig.cameras)
+    held_back = {name: why for name, why in reasons if why is not None}
+    if not held_back:
+        colmap.write_colmap_model(folder, rig)
+        return None
+    colmap.remove_colmap_model(folder)  # one of an older rig would be believed
+    name, why = next(iter(held_back.items()))
+    others = f" ({len(held_back)} cameras are so)" if len(held_back) > 1 else ""
+    return f"no COLMAP model is written: camera {name!r} has {why}{others}; rig.json holds all"
 
 
 def _write_certificate(

@@ -89,7 +89,7 @@ def convert(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    r"""Read RIG in any of the formats that --to writes, and write it in another.
+    r"""Read RIG in any of the formats that --to writes, or of EasyMocap, MC-Calib or NeRF.
 
     RIG is a file, the folder of a COLMAP model, or a path with {camera} in it: one file a camera.
     Its format is recognised by its content. What the new format has no place for is told; what
@@ -108,7 +108,7 @@ def convert(
         rig,
         unit=from_unit,
         pixel_centre=None if from_pixel_centre is None else float(from_pixel_centre),
-        image_size=image_size,
+        image_sizes=image_size,
         names=cameras,
     )
     for path in output_files(found, to, output):

@@ -1,5 +1,6 @@
 """Rigs in the files of other programs: what they mean, what they cannot hold, what is wrong."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -298,6 +299,272 @@ def test_multicals_relative_poses_are_linked_from_an_absolute_one(tmp_path: Path
         )
 
 
+def opencv_matrix(key: str, values: NDArray[np.float64], indent: str = "") -> str:
+    rows, columns = np.atleast_2d(values).shape
+    return (
+        f"{indent}{key}: !!opencv-matrix\n{indent}  rows: {rows}\n{indent}  cols: {columns}\n"
+        f"{indent}  dt: d\n{indent}  data: {values.ravel().tolist()}\n"
+    )
+
+
+def write_easymocap(folder: Path, *, sized: bool = True, **extrinsics: NDArray[np.float64]) -> None:
+    """Write two cameras; entries of the second file may be others."""
+    names = 'names:\n  - "01"\n  - "02"\n'
+    lenses, poses = "%YAML:1.0\n---\n" + names, "%YAML:1.0\n---\n" + names
+    for name in ("01", "02"):
+        lenses += opencv_matrix(f"K_{name}", MATRIX)
+        lenses += opencv_matrix(f"dist_{name}", DISTORTION)
+        lenses += f"H_{name}: 720\nW_{name}: 1280\n" if sized else ""
+        entries = {
+            f"R_{name}": RVEC[:, None],
+            f"Rot_{name}": ROTATION,
+            f"T_{name}": POSE[:, 3:],
+        } | {key: value for key, value in extrinsics.items() if key.endswith(name)}
+        poses += "".join(opencv_matrix(key, value) for key, value in entries.items())
+    (folder / "intri.yml").write_text(lenses)
+    (folder / "extri.yml").write_text(poses)
+
+
+@pytest.mark.parametrize("name", ["intri.yml", "extri.yml", "."])
+@pytest.mark.parametrize("sized", [True, False])
+def test_easymocaps_two_files_are_one_rig(tmp_path: Path, name: str, sized: bool) -> None:
+    write_easymocap(tmp_path, sized=sized)
+
+    sizes = None if sized else {"01": (1280, 720), "02": (640, 480)}
+    rig = read_any_rig(tmp_path / name, unit="m", image_sizes=sizes)
+
+    assert [camera.name for camera in rig.cameras] == ["01", "02"]
+    assert rig["01"].width_px == 1280
+    assert rig["02"].height_px == (720 if sized else 480)
+    assert rig.provenance.format == "easymocap"
+    assert_images(rig["01"], opencv_pixels(MATRIX, DISTORTION, POSE, POINTS_WORLD))
+
+
+def test_easymocaps_files_that_disagree_or_are_alone_are_named(tmp_path: Path) -> None:
+    write_easymocap(tmp_path, Rot_02=rotation_about_axes((100.0, -20.0, 6.0)))
+    with pytest.raises(CalibrationError, match="camera '02': R_02 and Rot_02 are different"):
+        read_any_rig(tmp_path / "intri.yml", unit="m")
+
+    (tmp_path / "extri.yml").unlink()
+    with pytest.raises(CalibrationError, match=r"extri.yml: there is no such file; EasyMocap's"):
+        read_any_rig(tmp_path / "intri.yml", unit="m")
+
+
+def mccalib(groups: tuple[int, int] = (0, 0), count: int = 2) -> str:
+    """Return a file of a pinhole at the origin and a fisheye that stands at `POSE`'s inverse."""
+    ref_from_cam = np.vstack([invert(POSE), [0.0, 0.0, 0.0, 1.0]])
+    text = f"%YAML:1.0\n---\nnb_camera: {count}\n"
+    for number, (distortion, pose) in enumerate([(DISTORTION, np.eye(4)), (FISHEYE, ref_from_cam)]):
+        text += f"camera_{number}:\n" + opencv_matrix("camera_matrix", MATRIX, "   ")
+        text += opencv_matrix("distortion_vector", distortion, "   ")
+        text += f"   distortion_type: {number}\n   camera_group: {groups[number]}\n"
+        text += "   img_width: 1280\n   img_height: 720\n"
+        text += opencv_matrix("camera_pose_matrix", pose, "   ")
+    return text
+
+
+def test_mccalibs_poses_are_those_of_the_cameras(tmp_path: Path) -> None:
+    path = tmp_path / "calibrated_cameras_data.yml"
+    path.write_text(mccalib())
+
+    rig = read_any_rig(path, unit="m")
+    # A session may call cameras as MC-Calib calls their folders, counted from 1.
+    taken = import_rig(tmp_path, path.name, "m", None, {"Cam_002": (1280, 720)}, None)
+
+    ahead = POINTS_WORLD + np.array([0.0, 0.0, 2.0])
+    expected = opencv_pixels(MATRIX, DISTORTION, np.eye(3, 4), ahead)
+    np.testing.assert_allclose(project_points(rig["camera_0"], ahead)[0], expected, atol=EXACT_PX)
+    expected = opencv_pixels(MATRIX, FISHEYE, POSE, POINTS_WORLD, is_fisheye=True)
+    assert_images(rig["camera_1"], expected)
+    assert_images(taken["Cam_002"], expected)
+
+
+def test_mccalibs_cameras_that_have_no_place_in_each_other_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.yml"
+    path.write_text(mccalib(groups=(0, 1)))
+    with pytest.raises(CalibrationError, match=r"in 2 groups.*camera_1 in 1\); calibrate them tog"):
+        read_any_rig(path, unit="m")
+
+    # MC-Calib leaves those out that are not in its first group.
+    path.write_text(mccalib(count=3))
+    with pytest.raises(CalibrationError, match="'camera_2' has no pose in the group"):
+        read_any_rig(path, unit="m")
+    assert len(read_any_rig(path, unit="m", names=["camera_0", "camera_1"]).cameras) == 2
+
+
+def seen_by_opengl(points: NDArray[np.float64], fx: float, fy: float) -> NDArray[np.float64]:
+    """Return pixels of points in a camera's own axes: x right, y up, z backwards; no distortion."""
+    x, y, z = points.T
+    return np.column_stack([639.75 + fx * x / -z, 359.25 - fy * y / -z])
+
+
+#: A frame's matrix: a camera that looks along -z of its own axes from (0.3, -0.1, 2.5).
+LOOKS_DOWN = np.eye(4)
+LOOKS_DOWN[:3, 3] = [0.3, -0.1, 2.5]
+
+NERF_LENS = {"w": 1280, "h": 720, "cx": 639.75, "cy": 359.25, "fl_x": 900.5, "fl_y": 901.5}
+
+
+def transforms(frames: list[dict[str, object]], **lens: object) -> str:
+    return json.dumps(lens | {"frames": frames})
+
+
+def test_nerfs_cameras_look_along_minus_z_with_y_up(tmp_path: Path) -> None:
+    frames: list[dict[str, object]] = [
+        {"file_path": "./images/a.png", "transform_matrix": LOOKS_DOWN.tolist()},
+        {"file_path": "images/b.png", "transform_matrix": LOOKS_DOWN.tolist(), "fl_x": 700.0},
+    ]
+    (tmp_path / "transforms.json").write_text(transforms(frames, **NERF_LENS))
+
+    rig = read_any_rig(tmp_path / "transforms.json", unit="m")
+
+    assert [camera.name for camera in rig.cameras] == ["a", "b"]
+    own_axes = POINTS_WORLD - LOOKS_DOWN[:3, 3]
+    assert_images(rig["a"], seen_by_opengl(own_axes, 900.5, 901.5))
+    assert_images(rig["b"], seen_by_opengl(own_axes, 700.0, 901.5))
+
+
+@pytest.mark.parametrize("fisheye", [{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}, {}])
+def test_nerfs_coefficients_are_opencvs(tmp_path: Path, fisheye: dict[str, object]) -> None:
+    values = FISHEYE if fisheye else DISTORTION
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    frame: dict[str, object] = {
+        "file_path": "a.png",
+        "transform_matrix": LOOKS_DOWN.tolist(),
+        **dict(zip(keys, values.tolist(), strict=True)),
+    }
+    (tmp_path / "transforms.json").write_text(transforms([frame], **NERF_LENS, **fisheye))
+
+    camera = read_any_rig(tmp_path / "transforms.json", unit="m")["a"]
+
+    # Their principal point is from the corner of the image, OpenCV's from a pixel's centre.
+    matrix = np.array([[900.5, 0.0, 639.25], [0.0, 901.5, 358.75], [0.0, 0.0, 1.0]])
+    expected = opencv_pixels(matrix, values, np.eye(3, 4), RAYS, is_fisheye=bool(fisheye))
+    np.testing.assert_allclose(img_from_cam(camera, RAYS), expected, atol=EXACT_PX)
+
+
+def test_nerfs_angle_is_over_the_whole_width(tmp_path: Path) -> None:
+    frame: dict[str, object] = {"file_path": "r_0", "transform_matrix": LOOKS_DOWN.tolist()}
+    path = tmp_path / "transforms_train.json"
+    path.write_text(transforms([frame], camera_angle_x=np.pi / 2, w=800, h=600))
+
+    np.testing.assert_allclose(
+        read_any_rig(path, unit="m")["r_0"].params, [400.0, 400.0, 400.0, 300.0], rtol=1e-15
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"fl_x": None}, "fl_x is 'None', not a number"),
+        ({"k4": 0.1}, "its lens has k4, which only a fisheye has"),
+        ({"is_fisheye": True, "p1": 0.1}, "its lens has p1 and p2, which a fisheye has not"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not read"),
+        ({"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}, "the rotation mirrors"),
+        ({"transform_matrix": [[1, 0], [0, 1]]}, r"shape \(2, 2\), expected \(4, 4\)"),
+    ],
+)
+def test_what_nerf_has_and_colmap_has_not_is_refused(
+    tmp_path: Path, changes: dict[str, object], found: str
+) -> None:
+    frame = {"file_path": "a.png", "transform_matrix": LOOKS_DOWN.tolist()} | changes
+    (tmp_path / "transforms.json").write_text(transforms([frame], **NERF_LENS))
+
+    with pytest.raises(CalibrationError, match=r"frame 0 \('a'\): .*" + found):
+        read_any_rig(tmp_path / "transforms.json", unit="m")
+
+
+def test_nerfs_lens_that_is_not_told_is_refused(tmp_path: Path) -> None:
+    frame: dict[str, object] = {"file_path": "r_0", "transform_matrix": LOOKS_DOWN.tolist()}
+    path = tmp_path / "transforms_train.json"
+    path.write_text(transforms([frame], camera_angle_x=0.69))  # as Blender's synthetic scenes have
+
+    with pytest.raises(CalibrationError, match=r"its lens is not told; .* with w and h"):
+        read_any_rig(path, unit="m", image_sizes=(800, 800))
+
+
+#: Camera matrices that hold more than focal lengths and a principal point.
+SKEWED = MATRIX + np.array([[0.0, 1.25, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+def opencv_file(matrix: NDArray[np.float64], distortion: NDArray[np.float64], model: str) -> str:
+    return (
+        f"%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720\ndistortion_model: {model}\n"
+        + opencv_matrix("K", matrix)
+        + opencv_matrix("D", distortion)
+        + opencv_matrix("R", ROTATION)
+        + opencv_matrix("T", POSE[:, 3:])
+    )
+
+
+def skewed_toml(matrix: NDArray[np.float64]) -> str:
+    text = toml_section("cam_0", DISTORTION, RVEC.tolist(), POSE[:, 3].tolist())
+    return text.replace(str(MATRIX.tolist()), str(matrix.tolist()))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "way"),
+    [
+        ("a.yml", opencv_file(SKEWED, DISTORTION, "plumb_bob"), "or write 0 there if the program"),
+        ("a.yml", opencv_file(SKEWED, FISHEYE, "equidistant"), "calibrate with CALIB_FIX_SKEW"),
+        ("a.toml", skewed_toml(SKEWED), "calibrate without skew"),
+        ("a.yml", mccalib().replace("900.5, 0.0", "900.5, 1.25"), "calibrate without skew"),
+    ],
+)
+def test_a_skew_beside_distortion_is_refused(
+    tmp_path: Path, name: str, text: str, way: str
+) -> None:
+    (tmp_path / name).write_text(text)
+
+    with pytest.raises(CalibrationError, match=rf"has a skew of 1\.25 px .*{way}"):
+        read_any_rig(tmp_path / name, unit="m")
+
+
+def test_a_skew_of_a_pinhole_is_kept_and_rounding_beside_distortion_is_none(tmp_path: Path) -> None:
+    (tmp_path / "a.yml").write_text(opencv_file(SKEWED, np.zeros(5), "plumb_bob"))
+    pixels = POINTS_WORLD @ POSE[:, :3].T + POSE[:, 3]
+    pixels = pixels @ SKEWED.T
+    assert_images(
+        read_any_rig(tmp_path / "a.yml", unit="m")["a"], pixels[:, :2] / pixels[:, 2:] + 0.5
+    )
+
+    rounded = MATRIX + 1e-13 * (SKEWED - MATRIX)
+    (tmp_path / "a.yml").write_text(opencv_file(rounded, DISTORTION, "plumb_bob"))
+    assert_images(
+        read_any_rig(tmp_path / "a.yml", unit="m")["a"],
+        opencv_pixels(MATRIX, DISTORTION, POSE, POINTS_WORLD),
+    )
+
+
+def test_a_camera_matrix_that_is_transposed_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.yml").write_text(opencv_file(MATRIX.T, DISTORTION, "plumb_bob"))
+
+    with pytest.raises(CalibrationError, match=r"below its diagonal.*transposed, as MATLAB"):
+        read_any_rig(tmp_path / "a.yml", unit="m")
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("views.sfm", b'{"version": ["1", "0"], "views": [], "intrinsics_": []}'),  # AliceVision
+        ("sensors.yaml", b"sensor: camera\nT_BS: 3\n"),
+        ("chunk.xml", b"<?xml version='1.0'?><document version='1'><chunk/></document>"),
+        ("notes.txt", b"the cameras stand where they stood\n"),
+        ("calibration.pkl", b"\x80\x04\x95\xff\xfe rig"),
+        ("empty.yml", b""),
+    ],
+)
+def test_a_file_of_another_program_is_refused_with_what_is_read(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
+    (tmp_path / name).write_bytes(content)
+
+    with pytest.raises(
+        CalibrationError, match=r"a rig can be rig.json, .*NeRF \(transforms.json\)"
+    ):
+        read_any_rig(tmp_path / name, unit="m")
+
+
 # --- What is written --------------------------------------------------------------------------
 
 
@@ -503,7 +770,7 @@ def test_the_image_size_is_asked_for_where_a_file_does_not_say_it(tmp_path: Path
 
     with pytest.raises(CalibrationError, match="does not say the image size of camera 'cam1'"):
         read_any_rig(tmp_path / "rig.csv", unit="m")
-    rig = read_any_rig(tmp_path / "rig.csv", unit="m", image_size=(640, 480))
+    rig = read_any_rig(tmp_path / "rig.csv", unit="m", image_sizes=(640, 480))
     assert (rig["cam1"].width_px, rig["cam1"].height_px) == (640, 480)
 
 

@@ -670,7 +670,7 @@ def test_a_colmap_model_is_replaced_whole(tmp_path: Path, rig: Rig) -> None:
 def test_a_skew_that_colmap_cannot_hold_is_named(tmp_path: Path) -> None:
     skewed = Camera("cam1", "PINHOLE", 8, 6, np.array([9.0, 9, 4, 3]), np.eye(3, 4), 0.5)
 
-    with pytest.raises(CalibrationError, match=r"'cam1' has a skew of 0\.5 px"):
+    with pytest.raises(CalibrationError, match=r"'cam1': it has a skew of 0\.5 px"):
         write_colmap_model(tmp_path, Rig((skewed,)))
 
 

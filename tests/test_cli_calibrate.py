@@ -420,6 +420,58 @@ def test_a_camera_that_was_bumped_is_named_with_status_4(
     assert "cam1" not in shown.out.splitlines()[0].replace("cam1.", "")
 
 
+@pytest.mark.slow
+def test_a_rig_in_squares_and_without_sizes_is_checked_by_the_session_that_has_both(
+    run: Run, capsys: Captured, calibrated: tuple[Path, dict[str, Any], str], recorded: Path
+) -> None:
+    for camera in read_rig(calibrated[0] / "rig.json").cameras:
+        storage = cv2.FileStorage(str(recorded / f"{camera.name}.yml"), cv2.FILE_STORAGE_WRITE)
+        storage.write("K", camera.pinhole - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        storage.write("R", camera.cam_from_world[:, :3])
+        storage.write("T", camera.cam_from_world[:, 3:] / BOARD.square_m)
+        storage.release()
+    rig = recorded / "{camera}.yml"
+    path = standing(recorded)
+
+    in_squares = ("--check", rig, path, "--rig-unit", "squares", "--no-progress", "--json")
+    assert run("calibrate", *in_squares) == 0
+
+    assert json.loads(capsys.readouterr().out)["scale"] == pytest.approx(1.0, abs=0.01)
+
+
+# --- Rigs made elsewhere --------------------------------------------------------------------
+
+
+def test_a_rig_with_a_skew_is_taken_without_a_colmap_model_and_that_is_said(
+    run: Run, capsys: Captured, tmp_path: Path
+) -> None:
+    matrices = []
+    for camera in in_front():
+        write(tmp_path / f"{camera.name}/0.png", np.zeros(SIZE_PX[::-1], np.uint8))
+        skewed = camera.pinhole + np.outer([0.25, 0.0, 0.0], [0.0, 1.0, 0.0])
+        numbers = (skewed @ camera.cam_from_world).ravel().tolist()
+        matrices.append(" ".join([camera.name, *map(repr, numbers)]))
+    (tmp_path / "rig.csv").write_text("\n".join(matrices) + "\n")
+    (tmp_path / "session.toml").write_text(
+        'format = "hybridve-session"\nversion = 1\nfps = 25\nrig = "rig.csv"\nrig_unit = "m"\n'
+        + "".join(f'[[camera]]\nname = "{c.name}"\nmasks = "{c.name}/*.png"\n' for c in in_front())
+    )
+    older = tmp_path / "rig" / "colmap"
+    older.mkdir(parents=True)
+    (older / "cameras.txt").write_text("of another rig")
+
+    assert run("calibrate", tmp_path, "--no-progress") == 0
+
+    told = [line for line in capsys.readouterr().out.splitlines() if "COLMAP" in line]
+    assert told == [
+        "  no COLMAP model is written: camera 'left' has a skew of 0.25 px, which no lens of "
+        "COLMAP has (2 cameras are so); rig.json holds all"
+    ]
+    rig = read_rig(tmp_path / "rig" / "rig.json")
+    assert [camera.skew_px for camera in rig.cameras] == pytest.approx([0.25, 0.25])
+    assert not older.exists()
+
+
 # --- Degenerate recordings ------------------------------------------------------------------
 
 

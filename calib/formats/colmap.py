@@ -12,6 +12,33 @@ from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Rig
 
+#: The files of a COLMAP text model that are written.
+COLMAP_FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
+
+
+def refusal(camera: Camera) -> str | None:
+    """Return why {folder}: COLMAP cannot hold a camera, or None."""
+    if camera.skew_px:
+        return f"a skew of {camera.skew_px:.3g} px, which no lens of COLMAP has"
+    return None
+
+
+def remove_colmap_model(folder: Path) -> None:
+    """Remove what `write_colmap_model` wrote into a folder: it would be taken for that of a rig.
+
+    Raises
+    ------
+    CalibrationError
+        If a file cannot be removed.
+    """
+    try:
+        for name in COLMAP_FILES:
+            (folder / name).unlink(missing_ok=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    except OSError as error:
+        raise CalibrationError(f"{folder}: cannot be removed ({error.strerror})") from error
+
 
 def write_colmap_model(folder: Path, rig: Rig) -> None:
     """Write a rig as a COLMAP text model: one rig, one frame, one image a camera.
@@ -30,10 +57,10 @@ def write_colmap_model(folder: Path, rig: Rig) -> None:
     frame = pycolmap.Frame(frame_id=1, rig_id=1)
     rig_from_world = rig.cameras[0].cam_from_world
     for number, camera in enumerate(rig.cameras, start=1):
-        if camera.skew_px:
+        why = refusal(camera)
+        if why is not None:
             raise CalibrationError(
-                f"camera {camera.name!r} has a skew of {camera.skew_px:.3g} px, which no COLMAP "
-                "model holds; write rig.json only"
+                f"{folder}: COLMAP cannot hold camera {camera.name!r}: it has {why}"
             )
         model.add_camera(as_colmap(camera, number))
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)

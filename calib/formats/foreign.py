@@ -16,6 +16,10 @@ from hybridve.calib.pose import Pose, nearest_rotation, rotation_of
 _ROUNDED_ROTATION = 1e-3
 
 
+class UnknownRigError(CalibrationError):
+    """A file holds nothing that a reader knows: it is of another program, or no rig."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignCamera:
     """A camera as a foreign file has it: its own unit, its own pixel centre, perhaps no size.
@@ -88,14 +92,16 @@ def read_text(path: Path) -> str:
     Raises
     ------
     CalibrationError
-        If it is missing or not UTF-8.
+        If it is missing.
+    UnknownRigError
+        If it is not UTF-8.
     """
     try:
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise CalibrationError(f"{path}: cannot be read as text ({error.reason})") from error
+        raise UnknownRigError(f"{path}: cannot be read as text ({error.reason})") from error
 
 
 def as_numbers(value: Any, what: str, where: str) -> NDArray[np.float64]:

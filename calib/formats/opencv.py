@@ -25,8 +25,10 @@ from hybridve.calib.formats import opencv_lens
 from hybridve.calib.formats.foreign import (
     ForeignCamera,
     ForeignRig,
+    UnknownRigError,
     translation_in,
 )
+from hybridve.calib.formats.opencv_storage import read_storage
 from hybridve.calib.pose import rotation_vector
 
 #: How files of OpenCV's kind spell what they hold, in lower case without "_", "-" and blanks.
@@ -47,6 +49,12 @@ _KEYS = {
     "width": ("imagewidth", "width"),
     "height": ("imageheight", "height"),
 }
+
+#: What of these no other file is likely to have.
+_OF_A_CAMERA = ("matrix", "rotation", "translation", "pose")
+
+#: The most keys of a file that an error names.
+_MOST_TOLD = 12
 
 #: Endings by which OpenCV chooses how to write.
 SUFFIXES = (".xml", ".yml", ".yaml", ".json")
@@ -87,11 +95,20 @@ def read_opencv(path: Path, names: list[str]) -> ForeignRig:
     Raises
     ------
     CalibrationError
-        If it is not OpenCV's, lacks something, or holds another number of cameras.
+        If it lacks something, or holds another number of cameras.
+    UnknownRigError
+        If it is not OpenCV's, or holds nothing of a camera.
     """
     entries = _entries(path)
     if "m1" in entries and "m2" in entries:
         return _rig(_stereo_pair(path, entries, names))
+    known = {key for what in _OF_A_CAMERA for key in _KEYS[what]}
+    given = (entries.get(key) for key in known)
+    if not any(isinstance(value, np.ndarray) and value.size for value in given):
+        raise UnknownRigError(
+            f"{path}: holds no camera (known keys: {', '.join(sorted(known))}); it has "
+            f"{_some(entries)}"
+        )
     if len(names) != 1:
         raise CalibrationError(
             f"{path}: an OpenCV file holds one camera, expected {len(names)}; write the rig as "
@@ -106,7 +123,7 @@ def read_opencv(path: Path, names: list[str]) -> ForeignRig:
         if not isinstance(value, np.ndarray):
             raise CalibrationError(
                 f"{path}: holds no {what} (known keys: {', '.join(_KEYS[what])}); it has "
-                f"{', '.join(entries) or 'nothing'}"
+                f"{_some(entries)}"
             )
         return value
 
@@ -134,57 +151,23 @@ def read_opencv(path: Path, names: list[str]) -> ForeignRig:
     return _rig([camera])
 
 
+def _some(entries: dict[str, Any]) -> str:
+    """Return what a file has, as far as a line holds it."""
+    keys = list(entries)
+    more = f" and {len(keys) - _MOST_TOLD} more" if len(keys) > _MOST_TOLD else ""
+    return ", ".join(key[:40] for key in keys[:_MOST_TOLD]) + more if keys else "nothing"
+
+
 def _rig(cameras: list[ForeignCamera]) -> ForeignRig:
     return ForeignRig("opencv", tuple(cameras), pixel_centre=0.0, is_centre_fixed=False)
 
 
 def _entries(path: Path) -> dict[str, Any]:
     """Return the matrices, numbers and texts of an OpenCV file, by simplified key."""
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        is_open = storage.isOpened()
-    except (cv2.error, SystemError):
-        is_open = False
-    if not is_open:
-        raise CalibrationError(
-            f"{path}: not an OpenCV file; expected XML, YAML or JSON as cv::FileStorage writes it"
-        )
-    try:
-        root = storage.root()
-        entries: dict[str, Any] = {}
-        for key in root.keys():  # noqa: SIM118 - not a dict
-            simple = key.lower().replace("_", "").replace("-", "").replace(" ", "")
-            entries[simple] = _value(root.getNode(key))
-        return entries
-    finally:
-        storage.release()
-
-
-def _value(node: Any) -> Any:
-    if node.isInt() or node.isReal():
-        return float(node.real())
-    if node.isString():
-        return node.string()
-    if node.isSeq():
-        values = [_value(node.at(index)) for index in range(node.size())]
-        try:
-            return np.array(values, dtype=np.float64)
-        except (TypeError, ValueError):
-            return None
-    if node.isMap():
-        try:
-            matrix = node.mat()
-        except cv2.error:
-            matrix = None
-        if matrix is not None:
-            return np.asarray(matrix, dtype=np.float64)
-        data = node.getNode("data")  # ROS writes rows, cols and data
-        if data.isSeq():
-            values = _value(data)
-            rows, columns = node.getNode("rows"), node.getNode("cols")
-            if isinstance(values, np.ndarray) and rows.isInt() and columns.isInt():
-                return values.reshape(int(rows.real()), int(columns.real()))
-    return None
+    return {
+        key.lower().replace("_", "").replace("-", "").replace(" ", ""): value
+        for key, value in read_storage(path).items()
+    }
 
 
 def _stereo_pair(path: Path, entries: dict[str, Any], names: list[str]) -> list[ForeignCamera]:

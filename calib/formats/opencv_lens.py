@@ -2,7 +2,13 @@
 
 OpenCV has the centre of the top-left pixel at 0, COLMAP at 0.5. Both write the polynomial model's
 coefficients as k1 k2 p1 p2 k3 k4 k5 k6 (FULL_OPENCV) and the fisheye's as k1 k2 k3 k4. OpenCV's
-further eight coefficients (thin prism, tilt) are in no COLMAP model, and it projects without skew.
+further eight coefficients (thin prism, tilt) are in no COLMAP model.
+
+A skew, entry (1, 2) of the camera matrix, OpenCV's ``projectPoints`` leaves out, and its
+``calibrateCamera`` writes 0. Where there is one, another program calibrated (MATLAB, a projection
+matrix taken apart) or ``cv::fisheye::calibrate`` without ``CALIB_FIX_SKEW``, and means it. Without
+distortion it is kept; with it no COLMAP model holds it, and it is refused: left out, it would move
+pixels by up to its own size, and nobody would know.
 
 References
 ----------
@@ -41,6 +47,12 @@ _FISHEYE = {
 
 #: Most coefficients that OpenCV reads.
 _MOST_COEFFICIENTS = 14
+
+#: A skew moves pixels by this at most within 45 degrees of the axis; so little is rounding.
+_NO_SKEW_PX = 1e-3
+
+#: What else stands below the diagonal of a camera matrix, as a share of its largest entry.
+_NO_ENTRY = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +122,13 @@ def opencv_camera(
             f"{where}: camera matrix of shape {camera_matrix.shape}, expected (3, 3)"
         )
     pose = as_pose(rotation, translation, where)
+    below = camera_matrix[[1, 2, 2], [0, 0, 1]]
+    if (np.abs(below) > _NO_ENTRY * np.abs(camera_matrix).max()).any():
+        found = ", ".join(f"{value:g}" for value in below)
+        raise CalibrationError(
+            f"{where}: the camera matrix of {name!r} has {found} below its diagonal, expected "
+            "zeros; is it transposed, as MATLAB writes it?"
+        )
     camera_matrix = camera_matrix / camera_matrix[2, 2]
     fx, skew_px, cx = camera_matrix[0]
     fy, cy = camera_matrix[1, 1:]
@@ -135,6 +154,17 @@ def opencv_camera(
         model, lens = "OPENCV", coefficients[:4]
     else:
         model, lens = "PINHOLE", coefficients[:0]
+    if model != "PINHOLE" and abs(skew_px) > _NO_SKEW_PX:
+        way = (
+            "with CALIB_FIX_SKEW"
+            if is_fisheye
+            else "without skew, or write 0 there if the program that calibrated leaves it out, as "
+            "OpenCV does"
+        )
+        raise CalibrationError(
+            f"{where}: camera {name!r} has a skew of {skew_px:.3g} px (entry (1, 2) of its camera "
+            f"matrix) together with distortion, which no COLMAP model holds; calibrate {way}"
+        )
     return ForeignCamera(
         name,
         model,

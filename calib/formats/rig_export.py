@@ -7,9 +7,8 @@ from typing import Any
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats import caliscope, kalibr, multical, opencv, rows
+from hybridve.calib.formats import caliscope, colmap, kalibr, multical, opencv, rows
 from hybridve.calib.formats.approximate import approximate
-from hybridve.calib.formats.colmap import write_colmap_model
 from hybridve.calib.formats.rig_json import rig_json_text, write_texts
 from hybridve.calib.rig import Rig
 
@@ -18,9 +17,6 @@ UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 #: Stands for a camera's name in the path of a rig that is one file a camera.
 PLACEHOLDER = "{camera}"
-
-#: The files of a COLMAP text model that are written.
-_COLMAP_FILES = ("cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt")
 
 #: OpenCV's models as targets of an approximation, with so many free parameters.
 _OPENCV_5 = (("FULL_OPENCV", 9), ("OPENCV_FISHEYE", 8))
@@ -47,13 +43,9 @@ class _Target:
     unit: str | None = None
 
 
-def _colmap_refusal(camera: Camera) -> str | None:
-    return f"a skew of {camera.skew_px:.3g} px" if camera.skew_px else None
-
-
 _TARGETS = {
     "json": _Target(lambda _: None, unit="m"),
-    "colmap": _Target(_colmap_refusal),
+    "colmap": _Target(colmap.refusal),
     "opencv": _Target(opencv.refusal, _OPENCV_8),
     "csv": _Target(rows.refusal),
     "caliscope": _Target(caliscope.refusal, _OPENCV_5, unit="m"),
@@ -95,7 +87,7 @@ def output_files(rig: Rig, to: str, target: Path) -> list[Path]:
         If the format needs another kind of path.
     """
     if to == "colmap":
-        return [target / name for name in _COLMAP_FILES]
+        return [target / name for name in colmap.COLMAP_FILES]
     if to != "opencv":
         if PLACEHOLDER in str(target):
             raise CalibrationError(f"{target}: {to} is one file for all cameras; name one file")
@@ -152,7 +144,7 @@ def export_rig(
             reason = f"{target}: {to} cannot hold camera {camera.name!r}: it has {why}"
             # Only another lens can be put in a lens's place.
             if not known.substitutes or not camera.has_distortion:
-                raise CalibrationError(reason)
+                raise CalibrationError(f"{reason}; --to json holds every camera")
             if not approximate_lenses:
                 raise CalibrationError(
                     f"{reason}; --approximate takes the nearest lens it can hold"
@@ -165,7 +157,7 @@ def export_rig(
             replace(c, cam_from_world=c.cam_from_world * [1.0, 1.0, 1.0, 1.0 / unit_m])
             for c in cameras
         ]
-        write_colmap_model(target, Rig(tuple(moved)))
+        colmap.write_colmap_model(target, Rig(tuple(moved)))
     else:
         texts: dict[str, Callable[[], list[str]]] = {
             "json": lambda: [rig_json_text(rig)],

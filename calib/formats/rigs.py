@@ -15,11 +15,21 @@ import numpy as np
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.files import nearly
-from hybridve.calib.formats import caliscope, kalibr, multical, opencv, rows
+from hybridve.calib.formats import (
+    caliscope,
+    easymocap,
+    kalibr,
+    mccalib,
+    multical,
+    nerf,
+    opencv,
+    rows,
+)
 from hybridve.calib.formats.colmap import read_colmap_model
 from hybridve.calib.formats.foreign import (
     ForeignCamera,
     ForeignRig,
+    UnknownRigError,
     principal_point_index,
     read_text,
 )
@@ -29,6 +39,13 @@ from hybridve.calib.pose import nearest_to_axes
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.record import CalibrationRecord
 from hybridve.calib.rig import Rig, RigCovariance
+
+#: What is read, in words, for whoever comes with another file.
+_READ = (
+    "rig.json, a COLMAP model (its folder), OpenCV's XML, YAML and JSON, rows of matrices, and the "
+    "files of Caliscope, aniposelib, Kalibr, multical, EasyMocap, MC-Calib and NeRF "
+    "(transforms.json)"
+)
 
 #: Condition number from which on optical axes are called parallel: all within some 6 degrees.
 _PARALLEL = 100.0
@@ -91,11 +108,12 @@ def read_any_rig(
     source: Path,
     *,
     unit: str | None = None,
+    square_m: float | None = None,
     pixel_centre: float | None = None,
-    image_size: tuple[int, int] | None = None,
+    image_sizes: Mapping[str, tuple[int, int]] | tuple[int, int] | None = None,
     names: Sequence[str] = (),
 ) -> Rig:
-    """Read a rig in any of the `FORMATS`, recognised by its content.
+    """Read a rig in any of the formats known here, recognised by its content.
 
     Parameters
     ----------
@@ -104,10 +122,12 @@ def read_any_rig(
         camera.
     unit : str or None
         See `import_rig`.
+    square_m : float or None
+        See `import_rig`.
     pixel_centre : float or None
         See `import_rig`.
-    image_size : (width, height) or None
-        For files that do not say it.
+    image_sizes : mapping of str to (width, height), or (width, height), or None
+        For files that do not say it: by camera, or of all.
     names : sequence of str
         The cameras wanted, in this order; none: all.
 
@@ -117,7 +137,7 @@ def read_any_rig(
         Saying which file or camera, what was found and what was expected.
     """
     pattern = str(source)
-    factor_m = None if unit is None else metres_of(unit, None)
+    factor_m = None if unit is None else metres_of(unit, square_m)
     wanted = list(names)
     if PLACEHOLDER in pattern and not wanted:
         wanted = _names_on_disk(source)
@@ -132,11 +152,12 @@ def read_any_rig(
         raise CalibrationError(f"{pattern}: {missing}; calibrate it, or name the cameras wanted")
     sizes: dict[str, tuple[int, int]] = {}
     for name in wanted or [camera.name for camera in found.cameras]:
-        size_px = _foreign(found, name, pattern).size_px or image_size
+        given = image_sizes.get(name) if isinstance(image_sizes, Mapping) else image_sizes
+        size_px = _foreign(found, name, pattern).size_px or given
         if size_px is None:
             raise CalibrationError(
-                f"{pattern}: does not say the image size of camera {name!r}; give it, "
-                "width x height in pixels"
+                f"{pattern}: does not say the image size of camera {name!r}; give it, width x "
+                "height in pixels (--image-size)"
             )
         sizes[name] = size_px
     return _to_rig(found, pattern, unit, factor_m, pixel_centre, sizes)
@@ -309,10 +330,20 @@ def _read(root: Path, pattern: str, names: list[str]) -> ForeignRig | Rig:
     if PLACEHOLDER in pattern:
         return _read_one_a_camera(root, pattern, names)
     if path.is_dir():
+        if (path / easymocap.INTRINSICS).is_file():
+            return easymocap.read_easymocap(path)
         return _read_colmap_folder(path)
     if not path.is_file():
         raise CalibrationError(f"{path}: there is no such rig file{nearly(path)}")
-    return _read_file(path, names)
+    return _read_known(path, names)
+
+
+def _read_known(path: Path, names: list[str]) -> ForeignRig | Rig:
+    """Read one file, and say of one that is not known which are."""
+    try:
+        return _read_file(path, names)
+    except UnknownRigError as error:
+        raise CalibrationError(f"{error}; a rig can be {_READ}") from error
 
 
 def _read_one_a_camera(root: Path, pattern: str, names: list[str]) -> ForeignRig:
@@ -324,7 +355,7 @@ def _read_one_a_camera(root: Path, pattern: str, names: list[str]) -> ForeignRig
             raise CalibrationError(
                 f"{path}: there is no such file; the rig {pattern!r} needs one for camera {name!r}"
             )
-        rig = _read_file(path, [name])
+        rig = _read_known(path, [name])
         if isinstance(rig, Rig):
             raise CalibrationError(f"{path}: is a rig.json, which holds all cameras; name it alone")
         if len(rig.cameras) != 1:
@@ -351,6 +382,8 @@ def _read_file(path: Path, names: list[str]) -> ForeignRig | Rig:
             raise CalibrationError(f"{path}: not JSON ({error})") from error
         if multical.is_multical(content):
             return multical.read_multical(path)
+        if nerf.is_transforms(content):
+            return nerf.read_transforms(path)
         is_opencv = True
     elif start.startswith("<"):
         is_opencv = True
@@ -358,6 +391,10 @@ def _read_file(path: Path, names: list[str]) -> ForeignRig | Rig:
         return kalibr.read_chain(path)
     elif caliscope.is_camera_toml(text) or path.suffix.lower() == ".toml":
         return caliscope.read_camera_toml(path)
+    elif easymocap.is_easymocap(text):
+        return easymocap.read_easymocap(path)
+    elif mccalib.is_mccalib(text):
+        return mccalib.read_mccalib(path)
     return opencv.read_opencv(path, names or [path.stem]) if is_opencv else rows.read_rows(path)
 
 

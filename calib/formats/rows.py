@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.foreign import ForeignCamera, ForeignRig, as_rotation, read_text
+from hybridve.calib.formats.foreign import (
+    ForeignCamera,
+    ForeignRig,
+    UnknownRigError,
+    as_rotation,
+    read_text,
+)
 
 #: A skew below this comes from the decomposition's own rounding.
 _NO_SKEW_PX = 1e-9
@@ -63,6 +69,8 @@ def read_rows(path: Path) -> ForeignRig:
     ------
     CalibrationError
         Naming the line that is none.
+    UnknownRigError
+        If none is.
     """
     cameras: list[ForeignCamera] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -76,7 +84,8 @@ def read_rows(path: Path) -> ForeignRig:
         except ValueError:
             if not cameras and number == 1:
                 continue  # a header
-            raise CalibrationError(
+            kind = CalibrationError if cameras else UnknownRigError
+            raise kind(
                 f"{path}, line {number}: not a name and numbers: {line.strip()[:60]!r}"
             ) from None
         if not np.isfinite(numbers).all():
@@ -104,7 +113,7 @@ def read_rows(path: Path) -> ForeignRig:
             img_from_world = matrix @ np.column_stack([rotation, numbers[18:]])
         cameras.append(_decompose(words[0], img_from_world, where))
     if not cameras:
-        raise CalibrationError(
+        raise UnknownRigError(
             f"{path}: holds no camera; expected lines of a name and 12 numbers (a 3x4 matrix), "
             "or 21 (K, R and t)"
         )

@@ -189,7 +189,7 @@ def _import(session: Session, rig_file: RigFile, sizes_px: dict[str, tuple[int, 
     rig = import_rig(
         session.root,
         rig_file.pattern,
-        rig_file.unit or "m",
+        rig_file.unit,
         rig_file.pixel_centre,
         sizes_px,
         session.target.unit_m if session.target is not None else None,

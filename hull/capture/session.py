@@ -52,13 +52,13 @@ class RigFile:
         A path below the root; ``{camera}`` stands for each camera's name.
     unit : str or None
         Unit of its lengths; None for a rig.json, which knows.
-    pixel_centre : float
-        Where the centre of the top-left pixel lies, 0 or 0.5.
+    pixel_centre : float or None
+        Where the centre of the top-left pixel lies, 0 or 0.5; None: where its format has it.
     """
 
     pattern: str
     unit: RigUnit | None
-    pixel_centre: float
+    pixel_centre: float | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -260,7 +260,7 @@ class SessionTable(_Table):
     min_cameras: Annotated[int, Field(ge=1)] = 1
     rig: str | None = None
     rig_unit: RigUnit | None = None
-    rig_pixel_centre: float = 0.5
+    rig_pixel_centre: float | None = None
     rig_check: Literal["on", "off"] = "on"
     point: list[WorldPoint] = []
     mask_threshold: Annotated[int, Field(ge=0, le=254)] | None = None
@@ -270,8 +270,8 @@ class SessionTable(_Table):
 
     @field_validator("rig_pixel_centre")
     @classmethod
-    def _is_a_convention(cls, centre: float) -> float:
-        if centre not in (0.0, 0.5):
+    def _is_a_convention(cls, centre: float | None) -> float | None:
+        if centre not in (None, 0.0, 0.5):
             raise ValueError(f"found {centre}; expected 0.5 (COLMAP) or 0 (OpenCV)")
         return centre
 

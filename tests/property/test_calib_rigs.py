@@ -224,7 +224,7 @@ def test_every_format_gives_back_the_images_of_every_lens_that_it_holds(
         written = export_rig(rig, to, target, unit=unit)
         size_px = (640, 480) if to == "csv" else None
         names = [camera.name for camera in rig.cameras]
-        again = read_any_rig(target, unit=unit, image_size=size_px, names=names)
+        again = read_any_rig(target, unit=unit, image_sizes=size_px, names=names)
         assert all(path.is_file() for path in written.files)
         assert not list(Path(folder).rglob("*.partial"))
 

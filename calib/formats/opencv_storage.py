@@ -1,0 +1,90 @@
+"""What a file of OpenCV's ``cv::FileStorage`` holds, XML, YAML or JSON, as Python's own values.
+
+References
+----------
+https://docs.opencv.org/5.x/da/d56/classcv_1_1FileStorage.html
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hybridve.calib.errors import CalibrationError
+from hybridve.calib.formats.foreign import UnknownRigError
+
+#: Maps and lists inside each other more deeply than this are no rig.
+_DEEPEST = 20
+
+
+def read_storage(path: Path) -> dict[str, Any]:
+    """Return what stands at the top of a file, by its key.
+
+    Numbers come as float, texts as str, matrices and lists of numbers as float64 arrays, other
+    lists as list and maps as dict of these; what is none of it as None.
+
+    Raises
+    ------
+    CalibrationError
+        If OpenCV cannot read the file.
+    UnknownRigError
+        If it is none of OpenCV's.
+    """
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        is_open = storage.isOpened()
+    except (cv2.error, SystemError):
+        is_open = False
+    if not is_open:
+        raise UnknownRigError(
+            f"{path}: not an OpenCV file; expected XML, YAML or JSON as cv::FileStorage writes it"
+        )
+    try:
+        root = storage.root()
+        return {key: _value(root.getNode(key), 0) for key in root.keys()}  # noqa: SIM118 - no dict
+    except (cv2.error, SystemError) as error:
+        raise CalibrationError(f"{path}: damaged for OpenCV, which reads it ({error})") from error
+    finally:
+        storage.release()
+
+
+def _value(node: Any, depth: int) -> Any:
+    if node.isInt() or node.isReal():
+        return float(node.real())
+    if node.isString():
+        return node.string()
+    if depth > _DEEPEST:
+        return None
+    if node.isSeq():
+        values = [_value(node.at(index), depth + 1) for index in range(node.size())]
+        if any(isinstance(value, str) for value in values):  # "01" is a name, not a number
+            return values
+        try:
+            return np.array(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            return values
+    if node.isMap():
+        return _map(node, depth)
+    return None
+
+
+def _map(node: Any, depth: int) -> Any:
+    """Return the matrix that a map stands for, or what is in it."""
+    try:
+        matrix = node.mat()
+    except cv2.error:
+        matrix = None
+    if matrix is not None:
+        return np.asarray(matrix, dtype=np.float64)
+    entries = {
+        key: _value(node.getNode(key), depth + 1)
+        for key in node.keys()  # noqa: SIM118 - no dict
+    }
+    # ROS writes rows, cols and data, without OpenCV's sign that this is a matrix.
+    data, rows, columns = (entries.get(key) for key in ("data", "rows", "cols"))
+    if isinstance(data, np.ndarray) and isinstance(rows, float) and isinstance(columns, float):
+        if data.size != rows * columns:
+            return None
+        return data.reshape(int(rows), int(columns))
+    return entries
