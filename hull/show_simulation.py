@@ -20,6 +20,9 @@ Image = NDArray[np.uint8]
 #: Points of particles that a picture shows at most.
 _MOST_POINTS = 20_000
 
+#: What lamps tell of triangles.
+_LIT = "share_lit"
+
 #: Ways are drawn of the last so many frames.
 _PATH_FRAMES = 60
 
@@ -125,12 +128,18 @@ def _nothing(chain: Chain) -> Hull:
 
 
 def drawn_objects(simulation: StoredSimulation, row: int) -> list[DrawnObject]:
-    """Return the CAD as it stood in a row: what effects move, what files move, and what stands."""
+    """Return the CAD as it stood in a row: what effects move, what files move, and what stands.
+
+    What light, shadow and proximity tell of is drawn once; each triangle that lamps shine on as
+    bright as the one that reaches most of it.
+    """
+    shares = _shares_lit(simulation, row)
     meshes = [
         (name, vertices_world, group.shown.faces)
         for name, group in simulation.groups.items()
         if group.shown is not None
         and group.shown.faces is not None
+        and not _tells_of_others(simulation, name)
         and (vertices_world := places_at(group, row)) is not None
     ]
     taken = {name for name, _, _ in meshes}
@@ -148,9 +157,34 @@ def drawn_objects(simulation: StoredSimulation, row: int) -> list[DrawnObject]:
             collides=False,
             hit_triangles=np.zeros(0, np.uint32),
             hit_points_world=np.zeros((0, 3)),
+            share_lit=shares.get((name, len(faces))),
         )
         for name, vertices_world, faces in meshes
     ]
+
+
+def _tells_of_others(simulation: StoredSimulation, name: str) -> bool:
+    """Tell whether an effect's mesh is that of objects which stand, or which others move."""
+    about = simulation.groups[name].about
+    objects = {one for one in (about.get("objects") or [about.get("object")]) if one}
+    placed_by_others = {one[0] for one in (*simulation.standing, *simulation.moving)}
+    return bool(objects) and objects <= placed_by_others | (set(simulation.groups) - {name})
+
+
+def _shares_lit(
+    simulation: StoredSimulation, row: int
+) -> dict[tuple[str, int], NDArray[np.floating]]:
+    """Return by object and number of its triangles how much of each (T,) a lamp reaches."""
+    found: dict[tuple[str, int], NDArray[np.floating]] = {}
+    for group in simulation.groups.values():
+        if _LIT not in group.values:
+            continue
+        starts = group.about["object_first_triangle"]
+        parts = np.split(group.values[_LIT][row], starts[1:])
+        for name, share in zip(group.about["objects"], parts, strict=True):
+            key = (name, len(share))
+            found[key] = np.maximum(found[key], share) if key in found else share
+    return {key: share for key, share in found.items() if np.isfinite(share).all()}
 
 
 def places_at(group: StoredGroup, row: int) -> NDArray[np.float64] | None:

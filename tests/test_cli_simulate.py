@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from hybridve.calib.pose import placed
 from hybridve.hull.effects.instants import instants
 from hybridve.hull.report.simulation_file import read_simulation
+from hybridve.hull.show_simulation import drawn_objects
 
 Run = Callable[..., int]
 
@@ -123,7 +124,14 @@ def test_every_effect_meets_the_ball_and_tells_it(
         "rigid", "hinge", "cloth", "particles", "light", "shadow", "proximity",
     ]  # fmt: skip
     assert set(told["solvers"]) >= {"mujoco-core"}
-    groups = read_simulation(path).groups
+    simulation = read_simulation(path)
+    groups = simulation.groups
+    # What a lamp shines on is drawn once, each triangle as bright as the lamps reach it.
+    drawn = {one.name: one for one in drawn_objects(simulation, len(simulation.index) - 1)}
+    assert set(drawn) == {"box", "door", "sheet", "ground"}
+    reached = [groups[name].values["share_lit"][-1] for name in ("light", "shadow")]
+    np.testing.assert_array_equal(drawn["ground"].share_lit, np.maximum(*reached))
+    assert drawn["box"].share_lit is None
     # The hull reaches at least as far as the ball, 0.2 m, where the box began at 0.15 m.
     assert groups["box"].values["position_m"][-1, 0] >= 0.2 + 0.1 - 0.003
     assert groups["box"].values["hull_work_j"][-1] > 0

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,7 @@ from helpers.view_scene import (
     touched_box,
     view_from,
 )
+from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import ReportError
@@ -105,6 +107,26 @@ def test_what_touches_is_red_and_what_is_free_is_not(scene: tuple[Hull, Rig]) ->
     # The world's x axis and the legend are drawn in red too: only the middle counts.
     assert red[50:150, 110:210].sum() > 50
     assert none[50:150, 110:210].sum() == 0
+
+
+def test_what_a_lamp_does_not_reach_is_darker_triangle_by_triangle(scene: tuple[Hull, Rig]) -> None:
+    front = box("front", (1.0, 0.0, 0.0), 0.4)
+    view, count = view_from(4, 0, 0), len(front.faces)
+
+    def drawn(share_lit: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        item = replace(front, share_lit=share_lit)
+        image = draw_picture(*scene, [item], viewpoint=view, size_px=SIZE_PX)
+        return np.asarray(image[MIDDLE], np.float64)
+
+    plain, lit, dark = drawn(None), drawn(np.ones(count)), drawn(np.zeros(count))
+    half = drawn(np.full(count, 0.5))
+
+    np.testing.assert_array_equal(plain, lit)
+    # Colours are multiplied as they are encoded: 0.55 in the dark, and half-way 0.775.
+    is_face = is_blue_grey(lit)
+    assert is_face.mean() > MOST
+    assert np.median(dark[is_face] / lit[is_face]) == pytest.approx(0.55, abs=0.02)
+    assert np.median(half[is_face] / lit[is_face]) == pytest.approx(0.775, abs=0.02)
 
 
 def test_touching_triangles_shine_through_the_hull(scene: tuple[Hull, Rig]) -> None:

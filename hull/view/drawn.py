@@ -24,6 +24,8 @@ class DrawnObject:
         Numbers of the triangles with collision points.
     hit_points_world : (P, 3) float64
         The collision points, in metres.
+    share_lit : (T,) float or None
+        Of each triangle how much of it a lamp of the scene reaches: what it does not is drawn darker.
     """
 
     name: str
@@ -32,6 +34,7 @@ class DrawnObject:
     collides: bool
     hit_triangles: NDArray[np.uint32]
     hit_points_world: NDArray[np.float64]
+    share_lit: NDArray[np.floating] | None = None
 
     @property
     def corners_world(self) -> NDArray[np.float64]:

@@ -39,6 +39,9 @@ _SAMPLES = 2
 # Kinds of surface, the same in mesh.frag.glsl and overlay.frag.glsl.
 FREE, COLLIDING, TOUCHED = 1.0, 2.0, 3.0
 
+#: Added to the kind of a triangle that no lamp reaches; of one that is reached in part, less.
+DARKEST = 0.4
+
 HULL_RGB: Rgb = (0.86, 0.79, 0.70)
 FREE_RGB: Rgb = (0.56, 0.66, 0.77)
 COLLIDING_RGB: Rgb = (0.93, 0.79, 0.76)
@@ -274,6 +277,8 @@ class Painter(Closing):
             part[..., 3] = COLLIDING if item.collides else FREE
             if item.collides:
                 part[item.hit_triangles, :, 3] = TOUCHED
+            if item.share_lit is not None:
+                part[..., 3] += DARKEST * (1.0 - np.clip(item.share_lit, 0.0, 1.0))[:, None]
             parts.append(part.reshape(-1, 4))
         vertices = np.concatenate(parts)
         if len(vertices) == 0:

@@ -50,6 +50,7 @@ const float NEVER = 3.0e38;
 const float FAR = 1.0e38;
 const float SHARP_EDGE = 0.86;  // cosine between the normals on either side of a drawn edge
 const int OCCLUSION_TAPS = 8;
+const float DARK = 0.55;        // of a colour where no lamp of the scene reaches
 
 // A square stands for sRGB's curve: near enough for a drawing, and quick in software.
 vec3 linear(vec3 srgb) { return srgb * srgb; }
@@ -71,9 +72,10 @@ vec3 lit(vec3 base, vec3 n, float open) {
 
 vec3 base_of(float kind) {
     if (kind > 3.5) return inside_colour;
-    if (kind > 2.5) return touched_colour;
-    if (kind > 1.5) return colliding_colour;
-    return free_colour;
+    float bright = mix(1.0, DARK, clamp(fract(kind) / 0.4, 0.0, 1.0));
+    if (kind > 2.5) return bright * touched_colour;
+    if (kind > 1.5) return bright * colliding_colour;
+    return bright * free_colour;
 }
 
 // How strongly a line is drawn here because the surface breaks off or bends sharply.

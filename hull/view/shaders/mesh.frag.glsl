@@ -15,7 +15,8 @@
 // | 1      | normal | vec4 | towards the eye, local frame; w = kind                           |
 //
 // Kinds, the same in hull/view/paint.py: 1 free, 2 of an object that collides, 3 a triangle with
-// collision points, 4 inside the hull.
+// collision points, 4 inside the hull. To the first three is added up to 0.4 where lamps of the scene
+// do not reach.
 
 // INSERT
 
