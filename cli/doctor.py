@@ -121,7 +121,7 @@ def examine() -> dict[str, Any]:
 
     tried = try_each([need.module for need in _NEEDS])
     problems = [
-        f"{need.module} cannot be loaded ({tried[need.module].problem}), and without it not: "
+        f"{need.module} cannot be loaded ({tried[need.module].problem}), needed for "
         f"{need.serves}; {_remedy(tried[need.module].problem, need.package)}"
         for need in _NEEDS
         if tried[need.module].problem

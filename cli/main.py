@@ -113,6 +113,9 @@ def main() -> NoReturn:
     """Run the command line and leave with its exit status."""
     try:
         cli.main(_in_order(sys.argv[1:]), standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:  # whose message is the help
+        error.show()
+        sys.exit(error.exit_code)
     except click.ClickException as error:  # wrong usage
         context = getattr(error, "ctx", None)
         command = "hybridve" if context is None else context.command_path

@@ -56,14 +56,16 @@ def segment(
     from hybridve.hull.capture.rig import has_rig, load_rig, rig_digest
     from hybridve.hull.capture.room_check import check_room
     from hybridve.hull.capture.silhouette_io import SilhouetteWriter
-    from hybridve.hull.report.write import refuse_existing
+    from hybridve.hull.report.write import refuse_existing_in
     from hybridve.hull.trust import Desk, blank_causes
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
     terminal = Terminal(enabled=progress)
-    output = (session if session.is_dir() else session.parent) / "silhouettes.h5"
+    folder = session if session.is_dir() else session.parent
+    output = folder / "silhouettes.h5"
     loaded, _ = ask_all(
-        lambda: opened_session(session), lambda: refuse_existing(output, overwrite=overwrite)
+        lambda: opened_session(session),
+        lambda: refuse_existing_in(folder, output.name, overwrite=overwrite),
     )
     sizes_px = recorded_sizes(loaded)
     check_lengths(loaded, FrameRange())

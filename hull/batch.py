@@ -165,11 +165,9 @@ def detect_every(
     """
     _make_folder(folder)
     if not settings.resume:
-        for path in [
-            *(folder / report_name(one, other) for one in sessions for other in scenes),
-            table,
-        ]:
-            refuse_existing(path, overwrite=settings.overwrite)
+        refuse_existing(table, overwrite=settings.overwrite)
+        for path in (folder / report_name(one, other) for one in sessions for other in scenes):
+            refuse_result(path, resume=False, overwrite=settings.overwrite)
     dropped = settings.evaluation.drop_cameras
 
     def opened(path: Path) -> Session:

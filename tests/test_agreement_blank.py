@@ -2,14 +2,26 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from helpers.sessions import SIZE_PX, ball_mask, ring_matrix, write_ball_session, write_cube_scene
+from helpers.sessions import (
+    FOCAL_PX,
+    SIZE_PX,
+    ball_mask,
+    ring_matrix,
+    write_ball_session,
+    write_cube_scene,
+)
 from numpy.typing import NDArray
 
+from hybridve.calib.formats.rig_json import write_rig
+from hybridve.calib.formats.rigs import import_rig
+from hybridve.calib.lens import undistortion
+from hybridve.calib.rig import Rig
 from hybridve.hull.agreement.blank import (
     Blank,
     BlankLooks,
@@ -191,3 +203,31 @@ def test_masks_that_are_nearly_all_object_or_never_change_are_told(
         assert run("segment", session, "--unconfirmed", "--overwrite") == 0
         assert told in capsys.readouterr().out
         (session.parent / "silhouettes.h5").unlink()
+
+
+def bend(session: Path, strength: float) -> float:
+    """Give cam1 a lens that bends inwards; return which share of its pinhole image it recorded."""
+    sizes_px = {f"cam{camera}": SIZE_PX for camera in range(N_CAMERAS)}
+    rig = import_rig(session.parent, "rig.csv", "m", 0.5, sizes_px, None)
+    params = np.array([FOCAL_PX, SIZE_PX[0] / 2, SIZE_PX[1] / 2, strength])
+    bent = replace(rig.cameras[1], model="SIMPLE_RADIAL", params=params, skew_px=0.0)
+    write_rig(session.parent / "rig.json", Rig((rig.cameras[0], bent, *rig.cameras[2:])))
+    text = session.read_text(encoding="utf-8")
+    text = text.replace('rig = "rig.csv"\nrig_unit = "m"', 'rig = "rig.json"')
+    session.write_text(text, encoding="utf-8")
+    seen = undistortion(bent).seen
+    assert seen is not None
+    return float(seen.mean())
+
+
+@pytest.mark.slow
+def test_of_a_bent_lens_the_share_is_that_of_what_it_recorded(
+    run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    redraw(session, "cam1", lambda mask: np.full_like(mask, 255))
+
+    assert bend(session, -0.4) < 0.85
+    assert run("detect", session, "--scene", scene, "-o", tmp_path / "r.h5") == 0
+
+    told = capsys.readouterr().out
+    assert "cam1 is 100% object in all 12 frames, on average; are the masks black on white?" in told

@@ -129,6 +129,17 @@ def test_errors_become_one_line_and_a_status(
     assert "Traceback" not in shown.err
 
 
+def test_no_command_at_all_shows_the_help(
+    run: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run() == 2
+
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("Usage: hybridve")
+    assert any(line.split()[:1] == ["calibrate"] for line in lines)
+    assert not any("error:" in line for line in lines)
+
+
 def test_a_system_error_of_another_cause_is_not_taken_for_an_interruption(
     run: Callable[..., int], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,6 +67,7 @@ def test_a_mistake_is_one_line_that_names_it_and_leaves_nothing(
     assert after == before
 
 
+@pytest.mark.slow
 def test_the_session_that_is_spoilt_is_good(run: Run, folder: Path) -> None:
     assert run(*words("segment S", folder)) == 0
     assert run(*words("detect S --scene SCENE -o OUT --no-doubt", folder)) == 0

@@ -27,8 +27,7 @@ from hybridve.hull.capture.session import Session, SessionCamera, load_session
 
 _log = logging.getLogger(__name__)
 
-#: The keys of a camera that name pictures or clips, in the order of the work; and the recording's.
-SOURCES = ("intrinsics", "extrinsics", "background", "video", "masks")
+#: The keys of a camera that name its recording.
 RECORDINGS = ("video", "masks")
 
 #: Names that a message lists at most.
@@ -48,7 +47,7 @@ class SourceCheck(Told):
     Attributes
     ----------
     key : str
-        One of `SOURCES`.
+        "intrinsics", "extrinsics", "background", "video" or "masks".
     label : str
         What the session says.
     is_video : bool
@@ -175,7 +174,7 @@ class GlancedSource:
     Attributes
     ----------
     key : str
-        One of `SOURCES`.
+        "intrinsics", "extrinsics", "background", "video" or "masks".
     source : FrameSource
         What it names.
     width_px, height_px, channels, bits : int

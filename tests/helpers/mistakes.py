@@ -221,6 +221,7 @@ _PLAIN_CUBE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 MISTAKES = (
     # What a command is given.
+    Mistake("no such folder of a session", "segment S/no/where", ("no/where", "no such session")),
     Mistake("no such session", "segment S/nowhere", ("nowhere", "there is no such session")),
     Mistake(
         "a scene in place of the session",
@@ -321,6 +322,15 @@ MISTAKES = (
         "detect S --scene SCENE --scene S/other.toml -o S/cube.obj",
         ("cube.obj", "is a file", "folder"),
         lambda folder: (folder / "other.toml").write_text((folder / "scene.toml").read_text()),
+    ),
+    Mistake(
+        "one of several runs that was cut off",
+        "detect S --scene SCENE --scene S/other.toml -o S/reports",
+        ("session__session.h5.parts", "cut off", "--resume", "--overwrite"),
+        both(
+            lambda folder: (folder / "other.toml").write_text((folder / "scene.toml").read_text()),
+            lambda folder: (folder / "reports" / "session__session.h5.parts").mkdir(parents=True),
+        ),
     ),
     Mistake(
         "a picture of no kind",
@@ -530,10 +540,16 @@ MISTAKES = (
         session(('rig = "rig.csv"\nrig_unit = "m"\n', "")),
     ),
     Mistake(
+        "a rig with y upwards",
+        DETECT,
+        ("rig.csv", "cam1", "mirrored picture", "flip the pictures"),
+        lambda folder: _change_camera(folder, np.diag([1.0, -1.0, 1.0])),
+    ),
+    Mistake(
         "a camera that looks away",
         DETECT,
         ("nothing can be in the hull", "cam1"),
-        lambda folder: _turn_away(folder),
+        lambda folder: _change_camera(folder, np.diag([-1.0, 1.0, -1.0])),
     ),
     # The board.
     Mistake(
@@ -774,15 +790,15 @@ MISTAKES = (
 )
 
 
-def _turn_away(folder: Path) -> None:
-    """Turn the second camera of the rig by 180 degrees about its upright axis."""
+def _change_camera(folder: Path, turn: np.ndarray) -> None:
+    """Turn what the second camera of the rig sees, (3, 3), about its centre."""
     path = folder / "rig.csv"
+    pinhole = np.array([[150.0, 0, 80], [0, 150.0, 60], [0, 0, 1]])
     rows = []
     for line in path.read_text(encoding="utf-8").splitlines():
         name, *numbers = line.split(",")
         matrix = np.array([float(number) for number in numbers]).reshape(3, 4)
         if name == "cam1":
-            pinhole = np.array([[150.0, 0, 80], [0, 150.0, 60], [0, 0, 1]])
-            matrix = pinhole @ np.diag([-1.0, 1.0, -1.0]) @ np.linalg.inv(pinhole) @ matrix
+            matrix = pinhole @ turn @ np.linalg.inv(pinhole) @ matrix
         rows.append(",".join([name, *map(repr, map(float, matrix.ravel()))]))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
