@@ -1,12 +1,14 @@
-"""Compiles all that ``detect`` needs, before it is needed: at set-up, or by ``doctor --prepare``.
+"""Compiles all that commands need, before it is needed: at set-up, or by ``doctor --prepare``.
 
 The code is run on the tiniest input, and what was compiled is kept where every later start looks
-(see `hybridve.hull.jit`). numba compiles in one thread at a time. Two processes side by side were
-tried: 8 s instead of 11, for a third more work, as query and certificate share half of theirs.
+(see `hybridve.hull.jit`). numba compiles in one thread at a time; what effects alone need is
+compiled by a process beside, as it shares little with the rest.
 """
 
 import gc
+import tempfile
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from hybridve.hull.agreement.others import meets_others
 from hybridve.hull.agreement.outlines import outline_of, table_of
 from hybridve.hull.agreement.sight import sight_of
 from hybridve.hull.agreement.trials import Trial
-from hybridve.hull.cad.scene import SceneObject
+from hybridve.hull.cad.scene import SceneObject, load_scene
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings
 from hybridve.hull.contact.clearance import ClearanceMeter
@@ -26,14 +28,21 @@ from hybridve.hull.contact.components import connected_volumes
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
 from hybridve.hull.contact.patches import contact_patches
 from hybridve.hull.contact.respond import collision_point
+from hybridve.hull.effects.effect import Setting
+from hybridve.hull.effects.instants import instants
+from hybridve.hull.effects.kinds import make_effects, read_entries
 from hybridve.hull.jit import folder
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.silhouettes import Views, make_hull, make_views
 from hybridve.hull.query.walk import spans_in_hull
+from hybridve.hull.synth.meshes import box_mesh, sheet_mesh, write_stl
 
 #: Side in pixels of the images that are compiled with.
 _SIDE_PX = 64
+
+#: Of a camera a metre before the world's origin.
+_MATRIX = np.array([[50.0, 0, 32, 32], [0, 50, 32, 32], [0, 0, 1, 1]])
 
 #: Quads along an edge of the sheet that is compiled with: enough triangles for clusters.
 _QUADS = 48
@@ -49,17 +58,23 @@ def is_prepared() -> bool:
 
 
 def prepare_kernels() -> bool:
-    """Compile all that ``detect`` needs and keep it; tell whether it is kept."""
+    """Compile all that commands need and keep it; tell whether it is kept."""
     kept = folder()
     if kept is not None and not is_prepared():
         # The compiler leaves little that only a collection would free: a tenth of the time.
         collects = gc.isenabled()
         gc.disable()
+        beside = get_context("spawn").Process(target=_run_effects)
+        beside.start()
         try:
             _run_kernels()
+            beside.join()
         finally:
+            beside.kill()
             if collects:
                 gc.enable()
+        if beside.exitcode:
+            raise RuntimeError(f"what effects need was not compiled (status {beside.exitcode})")
         held = sorted(str(path.relative_to(kept)) for path in kept.rglob("*.nbc"))
         (kept / _SIGN).write_text("\n".join(held) + "\n", encoding="utf-8")
     return is_prepared()
@@ -97,10 +112,74 @@ def _run_kernels() -> None:
     sight_of(trio.views, mesh.vertices_world, mesh.faces)
 
 
+#: One object for each kind of effect, about the edge of what the cameras see, and a ground.
+_SCENE = """\
+format = "hybridve-scene"
+version = 1
+object = [
+  { name = "box", mesh = "box.stl", unit = "mm", translate_mm = [320, 0, 0] },
+  { name = "door", mesh = "box.stl", unit = "mm", translate_mm = [-320, 0, 0] },
+  { name = "sheet", mesh = "sheet.stl", unit = "mm", translate_mm = [0, 250, 0] },
+  { name = "ground", mesh = "box.stl", unit = "mm", translate_mm = [0, 0, -240] },
+  { name = "cart", mesh = "box.stl", unit = "mm", poses = "cart.csv" },
+]
+effect = [
+  { kind = "rigid", object = "box", mass_kg = 0.5 },
+  { kind = "hinge", object = "door", mass_kg = 0.5, axis = [0, 0, 1], anchor_mm = [0, 100, 0] },
+  { kind = "cloth", object = "sheet" },
+  { kind = "particles", count = 50, source_mm = [200, -200, -100, 400, 200, 100] },
+  { kind = "light", lamp_mm = [0, -300, 900], power_lm = 800, objects = ["ground"] },
+  { kind = "shadow", lamp_mm = [0, 300, 900], radius_mm = 20, objects = ["ground"] },
+  { kind = "proximity", object = "ground", zones_mm = [400, 150] },
+]
+"""
+
+
+def _run_effects() -> None:
+    """Run what effects compile: each meets a hull that comes by, and CAD that moves."""
+    with tempfile.TemporaryDirectory() as name, Native(1) as engine:
+        folder = Path(name)
+        write_stl(folder / "box.stl", box_mesh((160.0, 160.0, 160.0), 90.0), "box")
+        write_stl(folder / "sheet.stl", sheet_mesh((200.0, 200.0), (4, 4), 5.0, 1), "sheet")
+        rows = [f"{frame},{0.3 * frame},0,0.3,1,0,0,0" for frame in range(2)]
+        (folder / "cart.csv").write_text("\n".join(["frame,x,y,z,qw,qx,qy,qz", *rows]) + "\n")
+        (folder / "scene.toml").write_text(_SCENE)
+        scene = load_scene(folder / "scene.toml")
+        found = read_entries(scene)
+        views = make_views(
+            ("camera",) * 3,
+            np.full((3, 2), _SIDE_PX, np.int64),
+            np.array([_MATRIX] * 3),
+            origin_world=np.zeros(3),
+        )
+        claimed = frozenset(name for entry, _ in found for name in entry.table.claimed)
+        setting = Setting(scene, claimed, views, engine, step_s=0.002, frame_s=0.02)
+        effects = [effect for effect, _ in make_effects(found, setting)]
+        before, after = (
+            make_hull(views, [np.roll(_mask(), shift_px, axis=1)] * 3) for shift_px in (0, 4)
+        )
+        way = instants(
+            before,
+            after,
+            start_s=0.0,
+            elapsed_s=0.02,
+            frame=1,
+            step_s=0.002,
+            mode="interpolate",
+            motions={one.name: one.motion for one in scene.objects if one.motion is not None},
+            since=0,
+        )
+        for steps in way:
+            for instant in steps:
+                for effect in effects:
+                    effect.advance(instant, instant.elapsed_s / len(steps))
+        for effect in effects:
+            effect.values(after)
+
+
 def _views(count: int = 1) -> Views:
-    matrix = np.array([[50.0, 0, 32, 32], [0, 50, 32, 32], [0, 0, 1, 1]])
     sizes = np.full((count, 2), _SIDE_PX, np.int64)
-    return make_views(("camera",) * count, sizes, np.array([matrix] * count), "carve", 1)
+    return make_views(("camera",) * count, sizes, np.array([_MATRIX] * count), "carve", 1)
 
 
 def _apart(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
