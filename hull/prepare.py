@@ -23,6 +23,7 @@ from hybridve.hull.agreement.trials import Trial
 from hybridve.hull.cad.scene import SceneObject, load_scene
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings
+from hybridve.hull.contact.between import interpolated_hull
 from hybridve.hull.contact.clearance import ClearanceMeter
 from hybridve.hull.contact.components import connected_volumes
 from hybridve.hull.contact.detect import Body, detect_contacts, make_body
@@ -101,6 +102,7 @@ def _run_kernels() -> None:
     collision_point(contact, nowhere)
     contact.points()
     ClearanceMeter(*_tetrahedron(), is_closed=True).measure(hull)
+    interpolated_hull(hull, make_hull(views, [np.roll(_mask(), 4, axis=1)]), 0.5)
     spans_in_hull(hull, np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0)
     connected_volumes(hull)
     trio = make_hull(_views(3), [_mask()] * 3)

@@ -54,6 +54,7 @@ from hybridve.hull.effects.kinds import make_effects, read_entries, software_of
 from hybridve.hull.query.choose import open_engine
 from hybridve.hull.query.engine import Engine, EngineName
 from hybridve.hull.query.silhouettes import Hull
+from hybridve.hull.query.threads import Threads
 from hybridve.hull.report.machine import Run
 from hybridve.hull.report.simulation_data import (
     Group,
@@ -178,6 +179,8 @@ class Simulation:
         The libraries that the numbers depend on, and their versions.
     has_begun : bool
         Whether a frame had a hull yet.
+    threads : Threads
+        Make the hulls between frames.
     """
 
     chain: Chain
@@ -187,6 +190,7 @@ class Simulation:
     hull: HullMode
     software: Mapping[str, str]
     has_begun: bool = False
+    threads: Threads = field(default_factory=Threads)
 
     @classmethod
     def of(cls, chain: Chain, engine: Engine, settings: SimulateSettings) -> "Simulation":
@@ -400,6 +404,7 @@ class Simulation:
             mode=self.hull,
             motions=self._motions,
             since=before.index if before is not None and is_known else None,
+            threads=self.threads,
         )
 
     def header(self, settings: SimulateSettings, engine: Engine) -> SimulationHeader:

@@ -1,6 +1,7 @@
 """First contact between two frames: outlines that move, appear and cross, and what is said then."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,13 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
-from hybridve.hull.contact.outline_motion import interpolate_masks
+from hybridve.hull.contact.outline_motion import (
+    distances_where,
+    follow_outline,
+    interpolate_masks,
+    signed_distance_px,
+)
+from hybridve.hull.contact.pixel_boxes import slices_of
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points
@@ -127,6 +134,53 @@ def test_a_wire_that_moves_by_many_widths_is_not_lost() -> None:
     assert len(set(rows.tolist())) > 110
     assert columns.min() >= 64
     assert columns.max() <= 67
+
+
+@pytest.mark.parametrize("shape", [(97, 151), (203, 300)])
+@pytest.mark.parametrize("density", [0.0, 0.001, 0.3, 0.9999, 1.0])
+def test_distances_where_they_are_wanted_are_opencvs(
+    density: float, shape: tuple[int, int]
+) -> None:
+    rng = np.random.default_rng(3)
+    mask = (rng.random(shape) < density).astype(np.uint8)
+    mask[20:50, 60:120] = density > 0
+    wanted = (rng.random(mask.shape) < 0.5).astype(np.uint8)
+
+    found, expected = distances_where(mask, wanted), signed_distance_px(mask)
+
+    # Theirs may err by a rounding; on this machine large ones are the same to the bit.
+    np.testing.assert_allclose(found[wanted > 0], expected[wanted > 0], rtol=1e-6)
+    np.testing.assert_array_equal(np.sign(found), np.sign(expected))
+
+
+def test_outlines_are_what_distances_everywhere_make_of_them_to_the_bit() -> None:
+    rng = np.random.default_rng(7)
+    n_moves = 0
+    for _ in range(12):
+        starts = rng.uniform((20, 20), (WIDTH - 20, HEIGHT - 20), (3, 2))
+        radii, ways = rng.uniform(3, 25, 3), rng.uniform(-25, 25, (3, 2))
+        before, after = (
+            np.maximum.reduce(
+                [
+                    disc(start + f * way, r)
+                    for start, way, r in zip(starts, ways, radii, strict=True)
+                ]
+            )
+            for f in (0.0, 1.0)
+        )
+        outline = follow_outline(before, after, (0, HEIGHT, 0, WIDTH))
+        crop = slices_of(outline.crop)
+        n_moves += len(outline.moves)
+
+        everywhere = replace(
+            outline,
+            distance_before=signed_distance_px(before[crop]),
+            distance_after=signed_distance_px(after[crop]),
+        )
+
+        for fraction in (0.125, 1 / 3, 0.5, 0.8):
+            np.testing.assert_array_equal(outline.at(fraction), everywhere.at(fraction))
+    assert n_moves > 12
 
 
 def test_masks_that_cannot_be_interpolated_are_refused() -> None:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from hybridve.hull.contact.outline_motion import Outline, follow_outline
 from hybridve.hull.contact.pixel_boxes import Box
 from hybridve.hull.query.silhouettes import Hull, Views, interpolated_views, make_hull
+from hybridve.hull.query.threads import Threads
 
 
 def interpolated_hull(before: Hull, after: Hull, fraction: float) -> Hull:
@@ -33,6 +34,8 @@ class Between:
     windows : list of box
         Where the silhouettes of each camera have to be right; those of a camera that moves are so
         everywhere, as an object may pass through any part of its image.
+    threads : Threads, optional
+        Follow the outlines of several cameras at once.
 
     Raises
     ------
@@ -40,15 +43,20 @@ class Between:
         If the hulls are not of the same cameras.
     """
 
-    def __init__(self, before: Hull, after: Hull, windows: list[Box]) -> None:
+    def __init__(
+        self, before: Hull, after: Hull, windows: list[Box], threads: Threads | None = None
+    ) -> None:
         interpolated_views(before.views, after.views, 0.5)  # other cameras are refused
         self._before, self._after = before, after
         first, second = before.views.img_from_local, after.views.img_from_local
-        self._still = {
-            camera: follow_outline(before.mask(camera), after.mask(camera), window)
-            for camera, window in enumerate(windows)
-            if (first[camera] == second[camera]).all()
-        }
+        still = [camera for camera in range(len(first)) if (first[camera] == second[camera]).all()]
+        followed = (threads or Threads(1)).run(
+            [
+                (follow_outline, (before.mask(camera), after.mask(camera), windows[camera]))
+                for camera in still
+            ]
+        )
+        self._still: dict[int, Outline] = dict(zip(still, followed, strict=True))
 
     def outlines(self, fraction: float) -> list[Outline]:
         """Return the outlines of all cameras; those of moving ones as they look at an instant."""

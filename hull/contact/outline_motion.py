@@ -1,8 +1,9 @@
 """How outlines move from one frame to the next: parts that are shifted, and what is neither."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from typing import Self
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from hybridve.hull.contact.pixel_boxes import (
     slices_of,
     union,
 )
+from hybridve.hull.jit import compiled
 
 #: Distances to an outline end here, so that they depend on no pixel farther away.
 CAP_PX = 64
@@ -42,6 +44,12 @@ _AS_GOOD = 0.2
 
 #: A shift must leave at most this share of the changed pixels unexplained.
 _UNEXPLAINED = 0.5
+
+#: Images of fewer pixels are OpenCV's to measure.
+_SMALL_PX = 1 << 14
+
+#: What is looked up of a moving thing is that near to its box: whole pixels, and between two.
+_LOOKED_AT_PX = 3
 
 #: A change of this width is an outline that moved by a pixel or two.
 OUTLINE_PX = 2.0
@@ -119,8 +127,9 @@ class Outline:
     crop : box
         Where distances are known.
     distance_before, distance_after : (crop) float32
-        Signed distances in pixels, positive on the object; right to `CAP_PX` within `changed`
-        and the boxes of `moves`.
+        Signed distances in pixels, positive on the object; right to `CAP_PX` where the masks differ
+        and about the boxes of `moves`, there before and here after. Elsewhere no more than their
+        sign is right, and nothing more is asked of them: where both masks agree they blend to that.
     moves : tuple of _Move
         What moves.
     """
@@ -206,14 +215,16 @@ def follow_outline(before: NDArray[np.uint8], after: NDArray[np.uint8], window: 
     for _, box in swept:
         needed = union(needed, box)
     crop = intersection(grown_box(needed, CAP_PX), whole)
+    distances = []
+    for mask, is_after in ((before, False), (after, True)):
+        wanted = difference[slices_of(crop)].copy()
+        for move, _ in swept:
+            box = shifted(move.box, move.shift_px) if is_after else move.box
+            box = intersection(grown_box(box, _LOOKED_AT_PX), crop)
+            wanted[slices_of(shifted(box, (-crop[2], -crop[0])))] = 1
+        distances.append(distances_where(np.ascontiguousarray(mask[slices_of(crop)]), wanted))
     return Outline(
-        before,
-        after,
-        changed,
-        crop,
-        signed_distance_px(before[slices_of(crop)]),
-        signed_distance_px(after[slices_of(crop)]),
-        tuple(move for move, _ in swept),
+        before, after, changed, crop, distances[0], distances[1], tuple(move for move, _ in swept)
     )
 
 
@@ -235,6 +246,62 @@ def signed_distance_px(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(signed - np.float32(0.5) * np.sign(signed), np.float32)
 
 
+def distances_where(mask: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return what `signed_distance_px` does where it is wanted, and elsewhere its sign alone.
+
+    OpenCV has another code, less exact by a rounding, for images so small that it takes no time.
+
+    Parameters
+    ----------
+    mask : (H, W) uint8
+        1 on the object, else 0.
+    wanted : (H, W) uint8
+        Not 0 where distances are to be right.
+    """
+    if mask.size < _SMALL_PX:
+        return signed_distance_px(mask)
+    return _distances_where(mask, wanted)
+
+
+@compiled
+def _distances_where(mask: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> NDArray[np.float32]:
+    height, width = mask.shape
+    beyond = np.int32(CAP_PX + 1)
+    # How far the nearest pixel of the other kind is in the same column.
+    away = np.zeros((height, width), np.int32)
+    for x in range(width):
+        away[0, x] = beyond
+    for y in range(1, height):
+        for x in range(width):
+            far = min(away[y - 1, x] + 1, beyond)
+            away[y, x] = far if mask[y, x] == mask[y - 1, x] else 1
+    for y in range(height - 2, -1, -1):
+        for x in range(width):
+            far = away[y + 1, x] + 1 if mask[y, x] == mask[y + 1, x] else 1
+            away[y, x] = min(away[y, x], far)
+    found = np.zeros((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            kind = mask[y, x]
+            pixels = np.float32(1.5)
+            if wanted[y, x]:
+                nearest = away[y, x] * away[y, x]
+                for beside in range(1, CAP_PX + 1):
+                    squared = beside * beside
+                    if squared >= nearest:
+                        break
+                    if x >= beside:
+                        far = away[y, x - beside] if mask[y, x - beside] == kind else 0
+                        nearest = min(nearest, squared + far * far)
+                    if x + beside < width:
+                        far = away[y, x + beside] if mask[y, x + beside] == kind else 0
+                        nearest = min(nearest, squared + far * far)
+                pixels = min(np.sqrt(np.float32(nearest)), np.float32(CAP_PX))
+            pixels -= np.float32(0.5)
+            found[y, x] = pixels if kind else -pixels
+    return found
+
+
 def _find_moves(
     before: NDArray[np.uint8],
     after: NDArray[np.uint8],
@@ -253,16 +320,24 @@ def _find_moves(
     left_over = difference[slices_of(crop)].copy()
     if not (left_over & first).any() or not (left_over & second).any():
         return []
-    near = cv2.dilate(left_over, np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), np.uint8))
+    # Even offsets: OpenCV numbers components by squares of two pixels.
+    whole = (0, first.shape[0], 0, first.shape[1])
+    top, bottom, left, right = grown_box(shifted(changed, (-crop[2], -crop[0])), 2 * _MARGIN_PX)
+    busy = intersection((top - top % 2, bottom, left - left % 2, right), whole)
+    near = cv2.dilate(
+        left_over[slices_of(busy)], np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), np.uint8)
+    )
     _, labels, stats, _ = cv2.connectedComponentsWithStats(near, connectivity=8)
-    areas = np.bincount(labels[left_over.view(np.bool_)], minlength=len(stats))
+    areas = np.bincount(labels[left_over[slices_of(busy)].view(np.bool_)], minlength=len(stats))
+    pair: _Pair | None = None
     moves: list[_Move] = []
     for label in np.argsort(-areas, kind="stable")[:_MOST_MOVES].tolist():
         if areas[label] < _SMALLEST_CHANGE_PX:
             break
         left, top, width, height = stats[label, :4].tolist()
-        part = (slice(top, top + height), slice(left, left + width))
-        cluster = labels[part] == label
+        cluster = labels[top : top + height, left : left + width] == label
+        box = shifted((top, top + height, left, left + width), (busy[2], busy[0]))
+        part = slices_of(box)
         change = left_over[part] * cluster
         if 2 * int(change.sum()) < areas[label]:
             continue  # explained by an earlier shift
@@ -270,40 +345,93 @@ def _find_moves(
         thickness_px = cv2.distanceTransform(change, cv2.DIST_L2, cv2.DIST_MASK_3).max()
         if thickness_px < OUTLINE_PX and 2 * kept >= areas[label]:
             continue
-        shift_px = _shift_of(first, second, (top, top + height, left, left + width), cluster)
+        pair = pair or _Pair.of(first, second)
+        shift_px = _shift_of(pair, box, cluster)
         if shift_px == (0, 0):
             continue
-        box = _explain(first, second, left_over, labels == label, shift_px)
-        if not is_empty(box):
-            moves.append(_Move(shift_px, shifted(box, (crop[2], crop[0]))))
+        there = np.zeros(first.shape, np.bool_)
+        there[part] = cluster
+        explained = _explain(first, second, left_over, there, shift_px)
+        if not is_empty(explained):
+            moves.append(_Move(shift_px, shifted(explained, (crop[2], crop[0]))))
     return moves
 
 
-def _shift_of(
-    before: NDArray[np.uint8],
-    after: NDArray[np.uint8],
-    box: Box,
-    cluster: NDArray[np.bool_],
-) -> tuple[int, int]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Two masks in which shifts are searched, and their reduced images in frequencies.
+
+    Attributes
+    ----------
+    before, after : (H, W) uint8
+        The masks.
+    factor : int
+        By how much they are reduced.
+    size : (int, int)
+        Of the reduced images, with room to shift.
+    before_f, after_f : complex128
+        Their transforms.
+    """
+
+    before: NDArray[np.uint8]
+    after: NDArray[np.uint8]
+    factor: int
+    size: tuple[int, int]
+    before_f: NDArray[np.complex128]
+    after_f: NDArray[np.complex128]
+
+    @classmethod
+    def of(cls, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> Self:
+        """Return the pair of two masks."""
+        height, width = before.shape
+        factor = max(1, -(-max(before.shape) // _SEARCH_PX))
+        size = (
+            cv2.getOptimalDFTSize(2 * -(-height // factor)),
+            cv2.getOptimalDFTSize(2 * -(-width // factor)),
+        )
+        nothing = np.zeros((0, 0), np.complex128)
+        pair = cls(before, after, factor, size, nothing, nothing)
+        found = []
+        for mask in (before, after):
+            box = box_of(np.ascontiguousarray(mask))
+            found.append(pair.transformed(box, mask[slices_of(box)].astype(np.float64)))
+        return replace(pair, before_f=found[0], after_f=found[1])
+
+    def transformed(self, box: Box, part: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the transform of an image that is `part` in a box and 0 elsewhere, reduced."""
+        factor, (height, width) = self.factor, self.before.shape
+        small = np.zeros((-(-height // factor), -(-width // factor)))
+        if not is_empty(box):
+            top, left = box[0] // factor, box[2] // factor
+            # Squares that begin within the box, whole or cut by the border.
+            bottom, right = -(-box[1] // factor), -(-box[3] // factor)
+            own = intersection(
+                (factor * top, factor * bottom, factor * left, factor * right),
+                (0, height, 0, width),
+            )
+            image = np.zeros((own[1] - own[0], own[3] - own[2]))
+            image[slices_of(shifted(box, (-own[2], -own[0])))] = part
+            small[top:bottom, left:right] = _reduced(image, factor)
+        return np.fft.rfft2(small, self.size)
+
+
+def _shift_of(pair: _Pair, box: Box, cluster: NDArray[np.bool_]) -> tuple[int, int]:
     """Return the shift (x, y) under which two masks agree in a cluster; (0, 0) if there is none.
 
     Agreement is counted both ways: the pixels of the cluster in `after` against `before`, and
     those in `before` against `after`; everywhere by correlation in reduced images, then by pixels.
     """
-    factor = max(1, -(-max(before.shape) // _SEARCH_PX))
-    masks = [mask.astype(np.float64) for mask in (before, after)]
-    parts = [np.zeros_like(mask) for mask in masks]
-    for part, mask in zip(parts, masks, strict=True):
+    before, after, factor, size = pair.before, pair.after, pair.factor, pair.size
+    parts = []
+    for mask in (before, after):
         # Background as a whole weighs no more than what is thin in it, which reducing blurs.
-        here = mask[slices_of(box)] * cluster
+        here = mask[slices_of(box)].astype(np.float64) * cluster
         n_object, n_background = here.sum(), (cluster > here).sum()
         weight = min(1.0, n_object / n_background) if n_object and n_background else 1.0
-        part[slices_of(box)] = here - weight * (cluster > here)
-    small = [_reduced(image, factor) for image in (*masks, *parts)]
-    size = tuple(cv2.getOptimalDFTSize(2 * length) for length in small[0].shape)
-    before_f, after_f, part_before_f, part_after_f = (np.fft.rfft2(image, size) for image in small)
+        parts.append(pair.transformed(box, here - weight * (cluster > here)))
+    part_before_f, part_after_f = parts
     agreement = np.fft.irfft2(
-        part_after_f * np.conj(before_f) + np.conj(part_before_f) * after_f, size
+        part_after_f * np.conj(pair.before_f) + np.conj(part_before_f) * pair.after_f, size
     )
     # To whole pixels, so that ties are ties. Of peaks that are about as good the shortest shift: of
     # two like things each came from where it was, not from where the other was.
@@ -320,17 +448,12 @@ def _shift_of(
     at_y, at_x = np.nonzero(cluster)
     every = -(-len(at_y) // _JUDGES)
     at_y, at_x = at_y[::every] + box[0], at_x[::every] + box[2]
-    here_before, here_after = before[at_y, at_x], after[at_y, at_x]
+    at_y, at_x = np.ascontiguousarray(at_y), np.ascontiguousarray(at_x)
 
     @cache
     def judged(x: int, y: int) -> tuple[int, int, int, int]:
         """Return how much disagrees, then what settles ties: the shorter shift, then any order."""
-        disagree = 0
-        for mask, here, sign in ((before, here_after, -1), (after, here_before, 1)):
-            rows = np.clip(at_y + sign * y, 0, mask.shape[0] - 1)
-            columns = np.clip(at_x + sign * x, 0, mask.shape[1] - 1)
-            disagree += int(np.count_nonzero(mask[rows, columns] != here))
-        return disagree, x * x + y * y, y, x
+        return _n_disagree(before, after, at_y, at_x, x, y), x * x + y * y, y, x
 
     best = judged(x, y)
     step = factor
@@ -342,6 +465,27 @@ def _shift_of(
     if best[0] > _UNEXPLAINED * judged(0, 0)[0]:
         return 0, 0
     return best[3], best[2]
+
+
+@compiled
+def _n_disagree(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    at_y: NDArray[np.int64],
+    at_x: NDArray[np.int64],
+    x: int,
+    y: int,
+) -> int:
+    """Return how many of some pixels of each mask disagree with the other, shifted by (x, y)."""
+    height, width = before.shape
+    count = 0
+    for i in range(len(at_y)):
+        row, column = at_y[i], at_x[i]
+        source_y, source_x = min(max(row - y, 0), height - 1), min(max(column - x, 0), width - 1)
+        goal_y, goal_x = min(max(row + y, 0), height - 1), min(max(column + x, 0), width - 1)
+        count += before[source_y, source_x] != after[row, column]
+        count += after[goal_y, goal_x] != before[row, column]
+    return count
 
 
 def _reduced(image: NDArray[np.float64], factor: int) -> NDArray[np.float64]:

@@ -24,6 +24,7 @@ from hybridve.hull.contact.outline_motion import Outline
 from hybridve.hull.contact.pixel_boxes import box_of, grown_box, intersection, is_empty, slices_of
 from hybridve.hull.effects.effect import Course, Instant
 from hybridve.hull.query.silhouettes import Hull, Views
+from hybridve.hull.query.threads import Threads
 
 HullMode = Literal["interpolate", "hold"]
 
@@ -68,6 +69,7 @@ def instants(
     mode: HullMode,
     motions: Mapping[str, Motion] | None = None,
     since: int | None = None,
+    threads: Threads | None = None,
 ) -> Iterator[Sequence[Instant]]:
     """Yield for each hull that leads to a frame the instants of its equal steps.
 
@@ -91,10 +93,12 @@ def instants(
         Of the objects that move as a file says, by name; each has a pose of the frame.
     since : int or None
         Number of the frame before, if it has a pose of each, too; None where they are held.
+    threads : Threads, optional
+        Follow the outlines of several cameras at once.
     """
     n_hulls, between = 1, None
     if mode == "interpolate" and before is not None:
-        n_hulls, between = _way(before, after)
+        n_hulls, between = _way(before, after, threads or Threads(1))
     pace = pace_of(elapsed_s, step_s, n_hulls)
     last = before
     for number in range(1, n_hulls + 1):
@@ -136,7 +140,7 @@ def _courses(
     }
 
 
-def _way(before: Hull, after: Hull) -> tuple[int, Between | None]:
+def _way(before: Hull, after: Hull, threads: Threads) -> tuple[int, Between | None]:
     """Return how many hulls the way takes, and what gives them; None where it takes just one."""
     views = after.views
     most_px = MOST_MOTION_M / _pixels_m(views)
@@ -146,9 +150,8 @@ def _way(before: Hull, after: Hull) -> tuple[int, Between | None]:
         for camera in range(len(views))
     ):
         return 1, None
-    between = Between(
-        before, after, [(0, int(height), 0, int(width)) for width, height in views.sizes_px]
-    )
+    windows = [(0, int(height), 0, int(width)) for width, height in views.sizes_px]
+    between = Between(before, after, windows, threads)
     moved_px = np.array([_moved_px(outline) for outline in between.outlines(0.5)])
     n_hulls = math.ceil(float((moved_px / most_px).max()))
     return min(max(n_hulls, 1), MOST_HULLS), between
