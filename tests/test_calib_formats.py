@@ -543,6 +543,15 @@ def test_a_camera_matrix_that_is_transposed_is_refused(tmp_path: Path) -> None:
         read_any_rig(tmp_path / "a.yml", unit="m")
 
 
+def test_a_matrix_that_does_not_say_its_columns_is_none(tmp_path: Path) -> None:
+    text = opencv_file(MATRIX, DISTORTION, "plumb_bob")
+    (tmp_path / "a.yml").write_text(text.replace("cols: 1", "col: 1"))  # of T
+
+    # OpenCV's own reading of it ends the process, now and then.
+    with pytest.raises(CalibrationError, match="holds no translation"):
+        read_any_rig(tmp_path / "a.yml", unit="m")
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
