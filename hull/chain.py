@@ -6,6 +6,7 @@
     rig --------------------+-> Hull (one frame)
 """
 
+import logging
 import time
 from collections.abc import Callable, Generator
 from contextlib import closing
@@ -22,6 +23,7 @@ from hybridve.calib.lens_bound import lens_shift_px
 from hybridve.calib.pose import Pose
 from hybridve.calib.rig import Rig
 from hybridve.hull.agreement.common_view import common_view
+from hybridve.hull.agreement.layout import odd_parts
 from hybridve.hull.cad.scene import Scene, SceneObject
 from hybridve.hull.capture.recording import (
     FrameRange,
@@ -49,6 +51,8 @@ from hybridve.hull.query.silhouettes import (
     make_seen,
     make_views,
 )
+
+_log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from hybridve.hull.contact.outline_errors import DoubtSettings
@@ -199,7 +203,8 @@ def make_chain(
     """Return everything that is the same for all frames.
 
     `progress` is told ``(what, done, total)`` while a rig that was not tested yet is tested. A
-    camera that has moved since it was calibrated is logged as a warning, and stands in ``room``.
+    camera that has moved since it was calibrated is logged as a warning, and stands in ``room``;
+    so is a part whose size or place does not go with what the cameras see.
 
     Raises
     ------
@@ -214,8 +219,12 @@ def make_chain(
     if silhouettes is None:
         check_lengths(session, settings.frames)
     views, undistortions = rig_views(session, first_rig(rig, tracks))
-    if not tracks and (seen := common_view(views)).kind == "none":
-        raise SessionError(f"{session.path}: nothing can be in the hull: {seen.reason}")
+    if not tracks:
+        seen = common_view(views)
+        if seen.kind == "none":
+            raise SessionError(f"{session.path}: nothing can be in the hull: {seen.reason}")
+        for note in odd_parts(scene, views, seen).values():
+            _log.warning("%s", note)
     _refuse_no_common_pose(scene)
     bodies = []
     for scene_object in scene.objects:

@@ -30,6 +30,7 @@ from hybridve.calib.plain import Told
 from hybridve.calib.rig import Rig
 from hybridve.hull.agreement.blank import BlankKind, BlankLooks, blank_cameras, blank_message
 from hybridve.hull.agreement.common_view import CommonView, common_view
+from hybridve.hull.agreement.layout import first_seen, odd_parts
 from hybridve.hull.agreement.outlines import FrameOutlines
 from hybridve.hull.agreement.record import SessionAgreement
 from hybridve.hull.agreement.sight import sight_of
@@ -72,14 +73,6 @@ _N_TRIED = 6
 
 #: Frames spread over a recording in which a silhouette is the very same, from which on it is told.
 _LEAST_SAME = 3
-
-#: How large a file's parts are together, in distances from the cameras to what they look at: below
-#: the first and above the second its unit is asked for. A part of 1.5 mm in a room of 3 m is the
-#: smallest that passes, a hall of 150 m the largest.
-_TINY, _HUGE = 1.0 / 2000.0, 50.0
-
-#: So many of those distances from where the cameras look is far outside.
-_FAR = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -456,9 +449,7 @@ def _agreement(session: Session, rig: Rig, room: RoomCheck, frames: _Frames) -> 
 
 def _object(one: SceneObject, views: Views | None) -> ObjectCheck:
     """Return what there is to say of an object; one that moves where it is tracked first."""
-    if one.motion is not None:
-        pose = one.motion.world_from_rest(min(one.motion.poses))
-        one = one if pose is None else one.at(pose)
+    one = first_seen(one)
     low, high = (1e3 * corner for corner in one.box_world)
     share = None if views is None else sight_of(views, one.vertices_world, one.faces).share
     return ObjectCheck(
@@ -484,41 +475,20 @@ def _placing_notes(layout: Scene, objects: Sequence[ObjectCheck], views: Views |
     common: CommonView = common_view(views)
     if common.kind != "common":
         return []
-    middle_mm = 1e3 * common.point_world
-    centers_mm = 1e3 * (views.centers_local() + views.origin_world)
-    reach_mm = float(np.median(np.linalg.norm(centers_mm - middle_mm, axis=1)))
-    notes = []
+    odd = odd_parts(layout, views, common)
+    notes = list(odd.values())
     files: dict[str, list[ObjectCheck]] = {}
-    moving = {str(one.about.get("object", one.name)) for one in layout.objects if one.motion}
     for part, one in zip(layout.objects, objects, strict=True):
-        files.setdefault(str(part.about.get("object", part.name)), []).append(one)
+        if part.motion is None:
+            files.setdefault(str(part.about.get("object", part.name)), []).append(one)
     for name, parts in files.items():
-        low = np.min([one.low_mm for one in parts], axis=0)
-        high = np.max([one.high_mm for one in parts], axis=0)
-        size_mm = float((high - low).max())
-        where = f"{layout.path}: object {name!r}"
-        if not _TINY * reach_mm <= size_mm <= _HUGE * reach_mm:
-            notes.append(
-                f"{where} is {size_mm:.3g} mm large, where the cameras are {reach_mm:.0f} mm from "
-                "what they look at; is its unit right?"
-            )
+        if name in odd or any(one.seen_share for one in parts):
             continue
-        away_mm = float(
-            np.linalg.norm(np.maximum(0.0, np.maximum(low - middle_mm, middle_mm - high)))
+        needed = len(views) if views.unseen == "carve" else views.min_cameras
+        notes.append(
+            f"{layout.path}: object {name!r} is outside of what {needed} cameras see: it would be "
+            "'not seen' in every frame; is it placed right?"
         )
-        if name in moving or any(one.seen_share for one in parts):
-            continue
-        if away_mm > _FAR * reach_mm:
-            notes.append(
-                f"{where} is {away_mm:.3g} mm from where the cameras look, far outside of what "
-                "they see; are unit and translate_mm right?"
-            )
-        else:
-            needed = len(views) if views.unseen == "carve" else views.min_cameras
-            notes.append(
-                f"{where} is outside of what {needed} cameras see: it would be 'not seen' in every "
-                "frame; is it placed right?"
-            )
     return notes
 
 

@@ -417,7 +417,7 @@ def put(**more: Any) -> Callable[[Gltf], None]:
         (
             # What waits for a decoder: a buffer without numbers, although the file has some.
             lambda gltf: [view.update(buffer=1) for view in gltf.document["bufferViews"]],
-            "sound glTF 2.0 file: list index out of range",
+            "sound glTF 2.0 file: no entry of the number",
         ),
     ],
 )

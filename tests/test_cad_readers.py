@@ -1,5 +1,7 @@
 """What each kind of CAD file may hold besides plain faces: read, or refused by its place."""
 
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,8 +13,11 @@ from helpers.mesh_files import (
     dae,
     fan,
     fbx_text,
+    mesh_3mf,
+    model_3mf,
     obj,
     off,
+    package_3mf,
     text_fbx,
     text_ply,
     text_stl,
@@ -54,6 +59,9 @@ PLAIN_OBJ = obj(BOX, QUADS).decode()
 BINARY_STL = binary_stl(BOX, TRIANGLES)
 PLAIN_PLY = text_ply(BOX, QUADS).decode()
 PLAIN_OFF = off(BOX, QUADS).decode()
+OBJECT_3MF = f'<object id="1" name="box">{mesh_3mf(BOX, TRIANGLES)}</object>'
+ITEM_3MF = '<item objectid="1"/>'
+PLAIN_3MF = model_3mf(OBJECT_3MF, ITEM_3MF, "millimeter")
 
 
 def with_payload(stl: bytes, length: int) -> bytes:
@@ -109,6 +117,14 @@ FACET = "facet normal 0 0 0\n outer loop\n  vertex 0 0 0\n  vertex 1 0 0\n  vert
         ("edges.ply", PLAIN_PLY.replace("end_header", "element edge 1\nproperty int vertex1\n"
         "property int vertex2\nend_header") + "0 1\n"),
         ("index.ply", PLAIN_PLY.replace("vertex_indices", "vertex_index")),
+        ("plain.3mf", package_3mf(PLAIN_3MF)),
+        ("mark.3mf", package_3mf("\ufeff" + PLAIN_3MF)),
+        ("capital.3mf", package_3mf(PLAIN_3MF).replace(b"/3dmodel.model", b"/3DModel.model")),
+        ("mirrored.3mf", package_3mf(PLAIN_3MF.replace('<item objectid="1"', '<item objectid="1" '
+        'transform="-1 0 0 0 1 0 0 0 1 5 6 7"'))),
+        ("others.3mf", package_3mf(PLAIN_3MF.replace("<resources>", "<resources><colorgroup "
+        'xmlns="http://schemas.microsoft.com/3dmanufacturing/material/2015/02" id="9"><color '
+        'color="#FF0000"/></colorgroup>'), {"Metadata/thumbnail.png": "no picture"})),
     ],
 )  # fmt: skip
 def test_what_programs_write_is_read_whole(tmp_path: Path, name: str, content: str | bytes) -> None:
@@ -130,6 +146,32 @@ def test_what_programs_write_is_read_whole(tmp_path: Path, name: str, content: s
         ("a.stl", with_payload(BINARY_STL, 4)[:-1], "731 bytes, where its header promises 684"),
         ("a.stl", comma_stl().replace("vertex 0,", "vertex 0.", 1), "no number; the decimal"),
         ("a.stl", b"\x01\x02\x03", "neither text nor binary STL: 3 bytes"),
+        ("a.3mf", package_3mf(PLAIN_3MF)[:-1], "its ZIP cannot be read"),
+        ("a.3mf", b"PK", "its ZIP cannot be read: File is not a zip file; is it cut off"),
+        ("a.3mf", package_3mf(PLAIN_3MF).replace(b"_rels", b"_rolz"), "has no '_rels/.rels'"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace('v3="1"', 'v3="8"', 1)), "model, line 5: object"
+        " 'box': triangle 5 names vertex 8 of 8"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace('z="0.0"', "", 1)), "line 6: a vertex has no z"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace("100.0", "100,0")), "line 10: '100,0' is no num"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace("</vertices>", "")), "line 28, column [0-9]+"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace("<model", "<!DOCTYPE model [<!ENTITY a 'b'>]>"
+        "<model")), "line 2: it has a document type"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace("millimeter", "mm")), "unit is 'mm', expected one"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace('<item objectid="1"', '<item objectid="2"')),
+        "names object '2', and there is none"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace('<item', '<item transform="1 0 0"')),
+        "a transform of '1 0 0', expected 12 numbers"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace("</mesh>", "<beamlattice xmlns='http://b'/></mesh>")
+        ), "object 'box' has a beamlattice, which is not read; export a mesh"),
+        ("a.3mf", package_3mf(PLAIN_3MF.replace("<mesh>", "<booleanshape xmlns='http://b'/><mesh>")
+        ), "object 'box' is a booleanshape, which is not read"),
+        ("a.3mf", package_3mf(model_3mf(OBJECT_3MF, ITEM_3MF, head='xmlns:x="http://volumetric" '
+        'requiredextensions="x"')), "needs the extension 'http://volumetric', which is not"),
+        ("a.3mf", package_3mf(model_3mf('<object id="1"><components><component objectid="1"/>'
+        "</components></object>", ITEM_3MF)), "hold each other in a circle"),
+        ("a.3mf", package_3mf(PLAIN_3MF, {"Metadata/Slic3r_PE_model.config": '<metadata '
+        'type="volume" key="volume_type" value="NegativeVolume"/>'}), "makes a mesh a NegativeVol"),
+        ("a.3mf", package_3mf(model_3mf(OBJECT_3MF, "")), "no triangle was found in it"),
         ("a.obj", PLAIN_OBJ + "surf 0 1 0 1 1 2 3 4\n", "line 16: 'surf' holds a surface"),
         ("a.obj", PLAIN_OBJ + "call more.obj\n", "line 16: 'call' holds a surface"),
         ("a.obj", PLAIN_OBJ + "ff 1 2 3\n", "line 16: 'ff' is no statement of OBJ files"),
@@ -507,6 +549,156 @@ def test_a_gap_narrower_than_the_tolerance_is_found_so() -> None:
 
     assert examine_topology(vertices, faces).n_open_edges == 4
     assert gap == pytest.approx(width, rel=1e-6)
+
+
+# --- 3MF --------------------------------------------------------------------------------------
+
+
+def test_a_3mf_brings_its_unit_names_colours_and_places(tmp_path: Path) -> None:
+    resources = (
+        '<basematerials id="5"><base name="PLA" displaycolor="#FF000080"/></basematerials>'
+        + OBJECT_3MF.replace("<object", '<object pid="5" pindex="0"')
+        + '<object id="2" name="pair"><components><component objectid="1"/>'
+        '<component objectid="1" transform="2 0 0 0 2 0 0 0 2 10 0 0"/></components></object>'
+        + f'<object id="3" name="spare">{mesh_3mf(BOX, TRIANGLES)}</object>'
+        + f'<object id="4" type="support">{mesh_3mf(BOX, TRIANGLES)}</object>'
+    )
+    # (x, y, z) goes to (-y, x, z) + (0, 0, 1): rows follow the point.
+    build = '<item objectid="2" transform="0 1 0 -1 0 0 0 0 1 0 0 1"/><item objectid="4"/>'
+    path = write(tmp_path / "a.3mf", package_3mf(model_3mf(resources, build, "inch")))
+
+    cad = read_cad(path)
+
+    assert (cad.unit, cad.unit_m, cad.up) == ("inch", 0.0254, "z")
+    first, second = cad.parts
+    x, y, z = BOX.T
+    np.testing.assert_array_equal(first.vertices, np.column_stack([-y, x, z + 1]))
+    np.testing.assert_array_equal(second.vertices, np.column_stack([-2 * y, 2 * x + 10, 2 * z + 1]))
+    for part in cad.parts:
+        assert (part.name, part.material) == ("box", "PLA")
+        assert part.rgba == (1.0, 0.0, 0.0, 128 / 255)
+    assert "1 of its objects are not in its build, first 'spare'" in cad.notes
+    assert any("hold others up and are not read, first '4'" in note for note in cad.notes)
+
+
+def test_a_3mf_that_unfolds_without_end_is_refused(tmp_path: Path) -> None:
+    levels = "".join(
+        f'<object id="{n}"><components><component objectid="{n - 1}"/>'
+        f'<component objectid="{n - 1}"/></components></object>'
+        for n in range(1, 40)
+    )
+    empty = '<object id="0"><components/></object>'
+    path = write(
+        tmp_path / "a.3mf", package_3mf(model_3mf(empty + levels, '<item objectid="39"/>'))
+    )
+
+    with pytest.raises(SceneError, match="it places more than 200,000 objects"):
+        read_cad(path)
+
+
+def test_iges_is_refused_with_what_to_export(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"a \.igs cannot be read \(IGES holds loose.*export STEP"):
+        read_cad(write(tmp_path / "a.igs", "S      1"))
+
+
+# --- Single precision -------------------------------------------------------------------------
+
+
+def float_ply(vertices: NDArray[np.float64]) -> bytes:
+    head = (
+        f"ply\nformat binary_big_endian 1.0\nelement vertex {len(vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(TRIANGLES)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = b"".join(b"\3" + np.array(face, ">i4").tobytes() for face in TRIANGLES)
+    return head.encode() + vertices.astype(">f4").tobytes() + rows
+
+
+def float_glb(vertices: NDArray[np.float64]) -> bytes:
+    numbers = vertices.astype("<f4").tobytes() + np.array(TRIANGLES, "<u4").tobytes()
+    views = [
+        {"buffer": 0, "byteOffset": 0, "byteLength": 12 * len(vertices)},
+        {"buffer": 0, "byteOffset": 12 * len(vertices), "byteLength": 12 * len(TRIANGLES)},
+    ]
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": len(vertices), "type": "VEC3"},
+        {"bufferView": 1, "componentType": 5125, "count": 3 * len(TRIANGLES), "type": "SCALAR"},
+    ]
+    document = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": len(numbers)}],
+        "bufferViews": views,
+        "accessors": accessors,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "nodes": [{"mesh": 0, "scale": [3.0, 3.0, 3.0]}],
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    length = 28 + len(text) + len(numbers)
+    head = struct.pack("<4sII", b"glTF", 2, length) + struct.pack("<I4s", len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(numbers), b"BIN\0") + numbers
+
+
+SINGLE: dict[str, tuple[Callable[[NDArray[np.float64]], bytes], float]] = {
+    "part.stl": (lambda vertices: binary_stl(vertices, TRIANGLES), 1.0),
+    "part.ply": (float_ply, 1.0),
+    "part.glb": (float_glb, 3.0),
+}
+
+
+@pytest.mark.parametrize("name", SINGLE)
+@pytest.mark.parametrize("away", [(0.0, 0.0, 0.0), (5e6, -3e6, 4e6), (9e3, 1.0, 0.0)])
+def test_corners_are_no_further_off_than_the_rounding_that_is_told(
+    tmp_path: Path, name: str, away: tuple[float, float, float]
+) -> None:
+    writer, scale = SINGLE[name]
+    worst = 0.0
+    for k in range(1, 20):
+        vertices = BOX * (0.9 + k / 97.0) + np.array(away) + k / 31.0
+
+        (part,) = read_cad(write(tmp_path / f"{k}{name}", writer(vertices))).parts
+
+        expected = scale * vertices[np.array(TRIANGLES)]
+        off = np.linalg.norm(part.vertices[part.faces] - expected, axis=-1).max()
+        assert off <= part.rounding * (1 + 1e-12)
+        assert part.off_by_m == 0.0
+        worst = max(worst, off / part.rounding)
+    assert worst > 0.5
+
+
+def test_digits_of_a_text_are_taken_at_their_word(tmp_path: Path) -> None:
+    for name in ("text.stl", "plain.obj", "text.ply", "little.ply", "packed.3mf"):
+        vertices = BOX + 5e6
+        (part,) = read_cad(write(tmp_path / name, WRITERS[name][0](vertices, TRIANGLES))).parts
+
+        np.testing.assert_array_equal(part.vertices[part.faces], vertices[np.array(TRIANGLES)])
+        assert part.rounding == 0.0
+
+
+@pytest.mark.parametrize(("away_mm", "is_coarse"), [(0.0, False), (60_000.0, False), (5e6, True)])
+def test_the_rounding_of_a_file_is_part_of_its_error_where_it_matters(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, away_mm: float, is_coarse: bool
+) -> None:
+    write(tmp_path / "part.stl", binary_stl(BOX + np.array([away_mm, 0.0, 0.0]), TRIANGLES))
+    text = (
+        'format = "hybridve-scene"\nversion = 1\n[[object]]\nname = "box"\nmesh = "part.stl"\n'
+        f'unit = "mm"\ntranslate_mm = [{-away_mm}, 0, 0]\n'
+    )
+    path = write(tmp_path / "scene.toml", text)
+
+    (box,) = load_scene(path).objects
+
+    told = [record.getMessage() for record in caplog.records if "precision" in record.message]
+    assert len(told) == is_coarse
+    if is_coarse:
+        assert "object 'box'" in told[0]
+        assert (
+            "coordinates of up to 5,000 m in single precision are off by up to 0.25 mm" in told[0]
+        )
+    # Half of what lies between two numbers of 24 bits there, in metres.
+    step_m = float(np.spacing(np.float32(away_mm + 100.0))) / 2 / 1000.0
+    assert box.about["rounding_m"] == pytest.approx(step_m, rel=2e-2 if away_mm else 1.0)
+    assert box.tessellation_error_m == (box.about["rounding_m"] if away_mm else 0.0)
 
 
 # --- real files -------------------------------------------------------------------------------

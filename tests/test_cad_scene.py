@@ -173,6 +173,7 @@ def test_what_the_report_is_told_of_an_object_is_exact(folder: Path) -> None:
         "up": "z",
         "tessellation_m": None,
         "tessellation_error_m": 0.0,
+        "rounding_m": 0.0,
         "n_polygons": 0,
         "n_bent_polygons": 0,
         "bent_by_m": 0.0,

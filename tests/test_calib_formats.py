@@ -14,7 +14,7 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.rig_export import export_rig
 from hybridve.calib.formats.rigs import import_rig, read_any_rig
-from hybridve.calib.lens import img_from_cam, project_points
+from hybridve.calib.lens import cam_from_img, img_from_cam, project_points
 from hybridve.calib.pose import Pose, compose, invert, rotation_about_axes
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.rig import Mount, Rig, RigCovariance
@@ -543,6 +543,15 @@ def test_a_camera_matrix_that_is_transposed_is_refused(tmp_path: Path) -> None:
         read_any_rig(tmp_path / "a.yml", unit="m")
 
 
+def test_a_matrix_that_does_not_say_its_columns_is_none(tmp_path: Path) -> None:
+    text = opencv_file(MATRIX, DISTORTION, "plumb_bob")
+    (tmp_path / "a.yml").write_text(text.replace("cols: 1", "col: 1"))  # of T
+
+    # OpenCV's own reading of it ends the process, now and then.
+    with pytest.raises(CalibrationError, match="holds no translation"):
+        read_any_rig(tmp_path / "a.yml", unit="m")
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -669,15 +678,28 @@ def test_a_real_lens_is_approximated_where_its_polynomial_turns_back(tmp_path: P
 
 
 @pytest.mark.parametrize("to", ["opencv", "kalibr", "multical", "colmap", "aniposelib"])
-def test_a_skew_that_a_format_lacks_is_refused(tmp_path: Path, to: str) -> None:
-    camera = Camera("cam1", "PINHOLE", 8, 6, np.array([9.0, 9, 4, 3]), np.eye(3, 4), 0.5)
+def test_a_skew_that_a_format_lacks_is_refused_or_approximated_as_near_as_it_says(
+    tmp_path: Path, to: str
+) -> None:
+    params = np.array([900.0, 905.0, 320.0, 240.0])
+    camera = Camera("cam1", "PINHOLE", 640, 480, params, np.eye(3, 4), 0.5)
+    target = tmp_path / "a.yml"
 
-    for approximate_lenses in (False, True):
-        with pytest.raises(CalibrationError, match=r"a skew of 0\.5 px"):
-            export_rig(
-                Rig((camera,)), to, tmp_path / "a.yml", approximate_lenses=approximate_lenses
-            )
+    with pytest.raises(CalibrationError, match=r"a skew of 0\.5 px.*json holds every.*--approxim"):
+        export_rig(Rig((camera,)), to, target)
     assert not list(tmp_path.iterdir())
+
+    written = export_rig(Rig((camera,)), to, target, approximate_lenses=True)
+
+    error_px = written.approximated["cam1"]["error_px"]
+    again = read_any_rig(target, unit="m", names=["cam1"])["cam1"]
+    edges = np.stack(np.meshgrid([0.0, 640.0], [0.0, 240.0, 480.0]), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([cam_from_img(camera, edges), np.ones(len(edges))])
+    off_px = np.linalg.norm(img_from_cam(again, rays) - edges, axis=1)
+    assert again.skew_px == 0.0
+    assert off_px.max() <= 1.01 * error_px
+    # A shear moves the upper edge against the lower by this much, and nothing takes it back.
+    assert error_px == pytest.approx(0.5 * 240.0 / 905.0, rel=0.05)
 
 
 @pytest.mark.parametrize(

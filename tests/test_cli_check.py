@@ -214,7 +214,7 @@ def test_parts_are_told_with_size_place_and_what_is_seen(session: Path, check: C
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("unit", "said"), [("m", "2e+05 mm large"), ("ft", None)])
+@pytest.mark.parametrize(("unit", "said"), [("m", "200,000 mm large"), ("ft", None)])
 def test_a_part_a_thousand_times_too_large_is_told(
     session: Path, unit: str, said: str | None
 ) -> None:

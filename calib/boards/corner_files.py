@@ -3,12 +3,12 @@
 import csv
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Detection as Detection
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.opencv_storage import NotOpencvError, read_storage
 
 
 def read_corners(path: Path) -> NDArray[np.float64]:
@@ -37,28 +37,21 @@ def read_corners(path: Path) -> NDArray[np.float64]:
 
 def _read_corners_opencv(path: Path) -> NDArray[np.float64] | None:
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError):
+        entries = read_storage(path)
+    except NotOpencvError:
         return None
-    try:
-        if not storage.isOpened():
-            return None
-        node = storage.getNode("corners")
-        if not node.empty():
-            matrix = np.asarray(node.mat(), np.float64)
-            return matrix.reshape(-1, 2) if matrix.ndim > 1 and matrix.size % 2 == 0 else None
-        amount = storage.getNode("CornersAmount")
-        if amount.empty():
-            return None
-        corners = []
-        for index in range(int(amount.real())):
-            node = storage.getNode(f"Corner_{index}")
-            if node.empty() or node.size() != 2:
-                return None
-            corners.append([node.at(0).real(), node.at(1).real()])
-        return np.array(corners, dtype=np.float64).reshape(-1, 2)
-    finally:
-        storage.release()
+    matrix = entries.get("corners")
+    if isinstance(matrix, np.ndarray):
+        return matrix.reshape(-1, 2) if matrix.ndim > 1 and matrix.size % 2 == 0 else None
+    amount = entries.get("CornersAmount")
+    if not isinstance(amount, float):
+        return None
+    corners = [entries.get(f"Corner_{index}") for index in range(min(int(amount), len(entries)))]
+    if len(corners) < amount or not all(
+        isinstance(corner, np.ndarray) and corner.shape == (2,) for corner in corners
+    ):
+        return None
+    return np.array(corners, dtype=np.float64).reshape(-1, 2)
 
 
 def _read_corners_csv(path: Path) -> NDArray[np.float64] | None:

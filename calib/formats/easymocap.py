@@ -19,7 +19,7 @@ import numpy as np
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats import opencv_lens
 from hybridve.calib.formats.foreign import ForeignCamera, ForeignRig, as_pose, as_size
-from hybridve.calib.formats.opencv_storage import read_storage
+from hybridve.calib.opencv_storage import read_storage
 
 #: The two files, and what a camera has in each.
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"

@@ -26,7 +26,7 @@ from hybridve.calib.formats.foreign import (
     as_pose,
     as_size,
 )
-from hybridve.calib.formats.opencv_storage import read_storage
+from hybridve.calib.opencv_storage import read_storage
 from hybridve.calib.pose import invert
 
 _HEAD = re.compile(r"^nb_camera\s*:", re.MULTILINE)

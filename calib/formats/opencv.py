@@ -28,7 +28,7 @@ from hybridve.calib.formats.foreign import (
     UnknownRigError,
     translation_in,
 )
-from hybridve.calib.formats.opencv_storage import read_storage
+from hybridve.calib.opencv_storage import read_storage
 from hybridve.calib.pose import rotation_vector
 
 #: How files of OpenCV's kind spell what they hold, in lower case without "_", "-" and blanks.

@@ -21,6 +21,7 @@ PLACEHOLDER = "{camera}"
 #: OpenCV's models as targets of an approximation, with so many free parameters.
 _OPENCV_5 = (("FULL_OPENCV", 9), ("OPENCV_FISHEYE", 8))
 _OPENCV_8 = (("FULL_OPENCV", 12), ("OPENCV_FISHEYE", 8))
+_UNSKEWED = (("PINHOLE", 4),)
 _KALIBR_MODELS = (("OPENCV", 8), ("OPENCV_FISHEYE", 8), ("EUCM", 6), ("FOV", 5))
 
 
@@ -142,14 +143,20 @@ def export_rig(
         why = known.refusal(camera)
         if why is not None:
             reason = f"{target}: {to} cannot hold camera {camera.name!r}: it has {why}"
-            # Only another lens can be put in a lens's place.
-            if not known.substitutes or not camera.has_distortion:
+            # Only another lens can be put in a lens's place, and no skew in a skew's.
+            substitutes = _UNSKEWED if camera.skew_px else known.substitutes
+            if not substitutes or not (camera.has_distortion or camera.skew_px):
                 raise CalibrationError(f"{reason}; --to json holds every camera")
             if not approximate_lenses:
                 raise CalibrationError(
-                    f"{reason}; --approximate takes the nearest lens it can hold"
+                    f"{reason}; --to json holds every camera, and --approximate takes the nearest "
+                    "lens that can be held"
                 )
-            camera, error_px = approximate(camera, known.substitutes)
+            camera, error_px = approximate(camera, substitutes)
+            if (why := known.refusal(camera)) is not None:
+                raise CalibrationError(
+                    f"{target}: {to} cannot hold camera {camera.name!r}: it has {why}"
+                )
             approximated[camera.name] = {"model": camera.model, "error_px": error_px}
         cameras.append(camera)
     if to == "colmap":

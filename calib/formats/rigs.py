@@ -35,6 +35,7 @@ from hybridve.calib.formats.foreign import (
 )
 from hybridve.calib.formats.rig_export import PLACEHOLDER, UNITS_M, metres_of
 from hybridve.calib.formats.rig_json import FORMAT, check_focal_lengths, read_rig
+from hybridve.calib.opencv_storage import NotOpencvError
 from hybridve.calib.pose import nearest_to_axes
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.record import CalibrationRecord
@@ -342,7 +343,7 @@ def _read_known(path: Path, names: list[str]) -> ForeignRig | Rig:
     """Read one file, and say of one that is not known which are."""
     try:
         return _read_file(path, names)
-    except UnknownRigError as error:
+    except (UnknownRigError, NotOpencvError) as error:
         raise CalibrationError(f"{error}; a rig can be {_READ}") from error
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.fbx_nodes import Node, parse_nodes
-from hybridve.hull.cad.part import Contents, Part, Up, join_meshes, move
+from hybridve.hull.cad.part import Contents, Part, Up, join_meshes, move, single_rounding
 from hybridve.hull.cad.polygons import Cuts, PolygonError, cut_polygons
 
 #: The axes that rotations go about, the first of them first, by the number of the file.
@@ -30,6 +30,9 @@ _ORDERS = ("xyz", "xzy", "yzx", "yxz", "zxy", "zyx")
 
 #: Geometry without a surface, and targets of blended shapes, which count by their weight.
 _NO_SURFACE = ("Shape", "Line", "NurbsCurve", "Boundary")
+
+#: Vertices, triangles, what became of polygons, and what single precision may have moved.
+_Mesh = tuple[NDArray[np.float64], NDArray[np.int32], Cuts, float]
 
 _AXES = ("CoordAxis", "UpAxis", "FrontAxis")
 
@@ -127,7 +130,7 @@ class _Document:
                 template = kind.first("PropertyTemplate")
                 self._defaults[str(kind.values[0])] = _properties(template)
         self._shown: set[int] = set()
-        self._meshes: dict[int, tuple[NDArray[np.float64], NDArray[np.int32], Cuts]] = {}
+        self._meshes: dict[int, _Mesh] = {}
 
     def parts(self) -> Iterator[Part]:
         """Yield a part for each model with geometry that hangs below the root, in its order."""
@@ -180,20 +183,22 @@ class _Document:
             @ _rotation(turn, "xyz")
             @ _stretch(_vector(found, "GeometricScaling", 1.0))
         )
-        pieces, cuts = [], Cuts()
+        pieces, cuts, rounding = [], Cuts(), 0.0
         for geometry in self._of(number, "Geometry"):
             self._shown.add(geometry)
             if geometry not in self._meshes:
                 self._meshes[geometry] = self._mesh(geometry)
-            vertices, faces, found_cuts = self._meshes[geometry]
+            vertices, faces, found_cuts, found_rounding = self._meshes[geometry]
             if len(faces):
+                stretch = float(np.linalg.norm(matrix[:3, :3], 2))
                 pieces.append(move(vertices, faces, matrix))
-                cuts += found_cuts.scaled(float(np.linalg.norm(matrix[:3, :3], 2)))
+                cuts += found_cuts.scaled(stretch)
+                rounding = max(rounding, stretch * found_rounding)
         materials = self._of(number, "Material")
         material, rgba = "", None
         if len(materials) == 1:
             material, rgba = self._material(self._objects[materials[0]])
-        return Part(_name(model), *join_meshes(pieces), material, rgba, cuts)
+        return Part(_name(model), *join_meshes(pieces), material, rgba, cuts, rounding=rounding)
 
     def _material(self, node: Node) -> tuple[str, tuple[float, float, float, float] | None]:
         found = _properties(node, self._defaults.get("Material"))
@@ -204,10 +209,10 @@ class _Document:
         opacity = float((found.get("Opacity") or [1.0])[0])
         return _name(node), (red, green, blue, min(max(opacity, 0.0), 1.0))
 
-    def _mesh(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.int32], Cuts]:
+    def _mesh(self, number: int) -> _Mesh:
         """Return the vertices and triangles of a geometry."""
         node = self._objects[number]
-        nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int32), Cuts()
+        nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int32), Cuts(), 0.0
         if node.values[2] in _NO_SURFACE:
             return nothing
         label = f"geometry {_name(node)!r}"
@@ -232,7 +237,10 @@ class _Document:
             raise ValueError(f"{label}: polygon {error.number + 1}: {error}") from None
         except ValueError as error:
             raise ValueError(f"{label}: {error}") from None
-        return vertices, faces, cuts
+        rounding = 0.0
+        if len(points.values) == 1 and isinstance(points.values[0], np.ndarray):
+            rounding = single_rounding(points.values[0].reshape(-1, 3))
+        return vertices, faces, cuts, rounding
 
     def _refuse_what_deforms(self, geometry: int, label: str) -> None:
         for number in self._of(geometry, "Deformer"):

@@ -16,6 +16,7 @@ glTF 2.0 Specification, Khronos Group, sections 3.5 (scenes), 3.6 (buffers and a
 import base64
 import binascii
 import json
+import math
 import struct
 import urllib.parse
 from collections.abc import Iterator, Mapping
@@ -30,6 +31,7 @@ from hybridve.hull.cad.part import (
     fan_triangles,
     join_meshes,
     move,
+    single_rounding,
     strip_triangles,
 )
 
@@ -77,7 +79,10 @@ def parse_gltf(
         ]
         notes = _what_is_not_shown(document)
     except (KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
-        what = f"no {error} where one belongs" if isinstance(error, KeyError) else str(error)
+        what = str(error)
+        if isinstance(error, LookupError):
+            missing = error if isinstance(error, KeyError) else "entry of the number that is named"
+            what = f"no {missing} where one belongs"
         raise ValueError(f"not a sound glTF 2.0 file: {what}") from error
     filled = tuple(part for part in parts if len(part.faces))
     return Contents(filled, "m", 1.0, "y", notes=notes)
@@ -214,14 +219,14 @@ class _Reader:
         self, node: dict[str, Any], matrix: NDArray[np.float64], *, name_by_mesh: bool
     ) -> Part:
         mesh = self._document["meshes"][node["mesh"]]
-        pieces, made_of = [], []
+        pieces, made_of, roundings = [], [], [0.0]
         for primitive in mesh["primitives"]:
             mode = primitive.get("mode", _TRIANGLES)
             if mode in _NO_SURFACE:
                 continue
             if mode not in (_TRIANGLES, _STRIP, _FAN):
                 raise ValueError(f"a primitive of mode {mode!r}, which is none of glTF 2.0")
-            vertices = self._accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
+            vertices, rounding = self._positions(primitive["attributes"]["POSITION"])
             faces = self._faces(primitive, len(vertices))
             if len(faces) == 0:
                 continue
@@ -230,13 +235,32 @@ class _Reader:
             )
             pieces.append(move(vertices, faces, matrix))
             made_of.append(primitive.get("material"))
+            roundings.append(rounding * float(np.linalg.norm(matrix[:3, :3], 2)))
         names = [node.get("name"), mesh.get("name")]
         name = next((str(name) for name in names[:: -1 if name_by_mesh else 1] if name), "")
         vertices, faces = join_meshes(pieces)
         if len(set(made_of)) != 1 or made_of[0] is None:
-            return Part(name, vertices, faces)
+            return Part(name, vertices, faces, rounding=max(roundings))
         material = self._document["materials"][made_of[0]]
-        return Part(name, vertices, faces, str(material.get("name", "")), _colour(material))
+        return Part(
+            name,
+            vertices,
+            faces,
+            str(material.get("name", "")),
+            _colour(material),
+            rounding=max(roundings),
+        )
+
+    def _positions(self, number: int) -> tuple[NDArray[np.float64], float]:
+        """Return vertices (V, 3), and how far what they are written in may have moved them."""
+        rows = self._accessor(number)
+        accessor = self._document["accessors"][number]
+        dtype = np.dtype(_COMPONENTS[accessor["componentType"]])
+        rounding = single_rounding(rows)
+        if dtype.kind in "iu":  # quantized: half a step in each direction
+            step = 1.0 / np.iinfo(dtype).max if accessor.get("normalized") else 1.0
+            rounding = math.sqrt(3.0) * step / 2.0
+        return rows.astype(np.float64), rounding
 
     def _faces(self, primitive: dict[str, Any], n_vertices: int) -> NDArray[np.int32]:
         if "indices" in primitive:

@@ -13,7 +13,14 @@ from hybridve.calib.files import nearly
 from hybridve.hull.cad.mesh_cache import find_meshes, keep_meshes, mesh_key
 from hybridve.hull.cad.part import Contents, Part, Up, join_parts
 from hybridve.hull.cad.polygons import Cuts
-from hybridve.hull.cad.readers import FORMATS, TESSELLATED, leans_on, parse, reader_version
+from hybridve.hull.cad.readers import (
+    FORMATS,
+    NOT_READ,
+    TESSELLATED,
+    leans_on,
+    parse,
+    reader_version,
+)
 from hybridve.hull.cad.topology import Topology, examine_topology
 
 _log = logging.getLogger(__name__)
@@ -76,8 +83,10 @@ def kind_of(path: Path) -> str:
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         kinds = ", ".join(FORMATS)
+        why = NOT_READ.get(path.suffix.lower())
         raise SceneError(
-            f"{path}: a {path.suffix or 'file without suffix'} cannot be read; {kinds} can"
+            f"{path}: a {path.suffix or 'file without suffix'} cannot be read"
+            f"{f' ({why})' if why else ''}; {kinds} can: export STEP, where the program has it"
         )
     return kind
 
@@ -109,7 +118,7 @@ def read_cad(path: Path, *, merge: bool = False, tessellation_m: float = TESSELL
     except ValueError as error:
         raise SceneError(f"{path}: the file cannot be read: {error}") from error
     beside = {
-        name: _read_bytes(path.parent / name) for name in names if (path.parent / name).is_file()
+        name: _read_bytes(path.parent / name) for name in names if _is_file(path.parent / name)
     }
     how = f"{tessellation_m if kind in TESSELLATED else None} {'merge' if merge else 'split'}"
     reader = reader_version(kind)
@@ -150,6 +159,14 @@ def read_cad(path: Path, *, merge: bool = False, tessellation_m: float = TESSELL
         tessellation_m=tessellation_m if kind in TESSELLATED else None,
         notes=notes,
     )
+
+
+def _is_file(path: Path) -> bool:
+    """Tell whether there is a file; a damaged file may name what no file can be called."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -217,6 +234,7 @@ def _find(key: str) -> tuple[Contents, tuple[Topology, ...]] | None:
                 None if said["rgba"] is None else tuple(said["rgba"]),
                 Cuts(**said["cuts"]),
                 float(said["off_by_m"]),
+                float(said["rounding"]),
             )
             for (vertices, faces), said in zip(meshes, about["parts"], strict=True)
         )
@@ -242,6 +260,7 @@ def _keep(key: str, contents: Contents, topologies: tuple[Topology, ...]) -> Non
                 "rgba": part.rgba,
                 "cuts": asdict(part.cuts),
                 "off_by_m": part.off_by_m,
+                "rounding": part.rounding,
                 "topology": asdict(topology),
             }
             for part, topology in zip(contents.parts, topologies, strict=True)

@@ -19,7 +19,7 @@ _KIND = "meshes"
 
 #: Part of every key: the layout of an entry, what this package makes of a file by itself (it reads
 #: all kinds but STEP), and what it says of a mesh. Raised with any change of these.
-_VERSION = 4
+_VERSION = 5
 
 _Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 

@@ -34,6 +34,10 @@ class Part:
     off_by_m : float
         How far its triangles are from the surface that they stand for, in metres: 0 if the file is
         made of triangles or polygons, otherwise an estimate; see `hybridve.hull.cad.step`.
+    rounding : float
+        How far its corners may be from those that were written, in the unit of the file: what
+        single precision or whole numbers leave of coordinates. 0 where the file gives digits or
+        double precision, which are taken at their word, and where `off_by_m` has it in it.
     """
 
     name: str
@@ -43,6 +47,7 @@ class Part:
     rgba: tuple[float, float, float, float] | None = None
     cuts: Cuts = field(default_factory=Cuts)
     off_by_m: float = 0.0
+    rounding: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +116,21 @@ def join_parts(parts: Sequence[Part]) -> Part:
     made_of = {(part.material, part.rgba) for part in parts}
     material, rgba = made_of.pop() if len(made_of) == 1 else ("", None)
     cuts = sum((part.cuts for part in parts), Cuts())
-    return Part("", vertices, faces, material, rgba, cuts, max(part.off_by_m for part in parts))
+    off_by_m = max(part.off_by_m for part in parts)
+    rounding = max(part.rounding for part in parts)
+    return Part("", vertices, faces, material, rgba, cuts, off_by_m, rounding)
+
+
+def single_rounding(vertices: NDArray[np.generic]) -> float:
+    """Return how far single precision may have moved one of the vertices (V, 3).
+
+    Each coordinate by half of what lies between two numbers there; 0 if they are of another kind.
+    """
+    if vertices.dtype.kind != "f" or vertices.dtype.itemsize != np.dtype(np.float32).itemsize:
+        return 0.0
+    farthest = np.abs(vertices).max(axis=0, initial=0.0).astype(np.float32)
+    with np.errstate(invalid="ignore"):  # what is not finite is refused elsewhere
+        return float(np.linalg.norm(np.spacing(farthest).astype(np.float64))) / 2.0
 
 
 def strip_triangles(corners: NDArray[np.int64]) -> NDArray[np.int32]:

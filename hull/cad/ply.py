@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.cad.part import Contents, Part, strip_triangles
+from hybridve.hull.cad.part import Contents, Part, single_rounding, strip_triangles
 from hybridve.hull.cad.polygons import Cuts, PolygonError, cut_polygons
 from hybridve.hull.cad.text import number
 
@@ -77,10 +77,11 @@ def parse_ply(content: bytes) -> Contents:
     is_text = not order
     read = _read_text if is_text else _read_binary
     values = read(content[start:], elements, order)
-    vertices, faces, cuts = _surface(elements, values)
+    vertices, faces, rounding, cuts = _surface(elements, values)
     is_ended = not is_text or content.endswith((b"\n", b"\r"))
     return Contents(
-        (Part("", vertices, faces, cuts=cuts),) if len(faces) else (), is_ended=is_ended
+        (Part("", vertices, faces, cuts=cuts, rounding=rounding),) if len(faces) else (),
+        is_ended=is_ended,
     )
 
 
@@ -268,13 +269,14 @@ def _whole(value: float, element: _Element, row: int) -> float:
 
 def _surface(
     elements: list[_Element], values: dict[str, _Values]
-) -> tuple[NDArray[np.float64], NDArray[np.int32], Cuts]:
-    """Return the vertices (V, 3), and the triangles (T, 3) of all faces and strips."""
+) -> tuple[NDArray[np.float64], NDArray[np.int32], float, Cuts]:
+    """Return the vertices (V, 3), the triangles (T, 3) of all faces and strips, the rounding."""
     found = values.get("vertex", {})
-    axes = [found.get(axis) for axis in "xyz"]
-    if any(isinstance(axis, tuple) or axis is None for axis in axes):
+    axes = [axis for name in "xyz" if isinstance(axis := found.get(name), np.ndarray)]
+    if len(axes) < 3:
         raise ValueError("its vertices have no x, y and z; export it again")
-    vertices = np.stack([np.asarray(axis, np.float64) for axis in axes], axis=1)
+    rounding = float(np.linalg.norm([single_rounding(axis[:, None]) for axis in axes]))
+    vertices = np.stack([axis.astype(np.float64) for axis in axes], axis=1)
     pieces, cuts = [], Cuts()
     for element in elements:
         if element.name not in (_FACE, _STRIPS) or not element.count:
@@ -297,7 +299,7 @@ def _surface(
             raise ValueError(f"face {error.number + 1} of {element.count}: {error}") from None
         pieces.append(faces)
         cuts += found_cuts
-    return vertices, np.concatenate([np.zeros((0, 3), np.int32), *pieces]), cuts
+    return vertices, np.concatenate([np.zeros((0, 3), np.int32), *pieces]), rounding, cuts
 
 
 def _strips(

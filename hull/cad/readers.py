@@ -8,6 +8,7 @@
 | COLLADA        | `collada`                       | ``<unit>``   | ``<up_axis>`` | each node    |
 | STEP           | `step`: cascadio (OpenCASCADE)  | its own      | z             | each product |
 | FBX            | `fbx`                           | if it says   | as it says    | each model   |
+| 3MF            | `threemf`                       | its own      | z             | each placed  |
 
 All but STEP are read here, because what libraries make of them loses something in silence. Seen
 with trimesh 5.2, Open3D 0.20 and pycollada 0.9: polygons left out, or cut so that they cover what
@@ -33,6 +34,7 @@ from hybridve.hull.cad.part import Contents
 from hybridve.hull.cad.ply import parse_ply
 from hybridve.hull.cad.step import parse_step
 from hybridve.hull.cad.stl import parse_stl
+from hybridve.hull.cad.threemf import parse_3mf
 
 #: What each suffix stands for.
 FORMATS = {
@@ -46,11 +48,18 @@ FORMATS = {
     ".step": "STEP",
     ".stp": "STEP",
     ".fbx": "FBX",
+    ".3mf": "3MF",
+}
+
+#: Kinds that are not read, and why; with all others the same is to be done.
+NOT_READ = {
+    ".igs": "IGES holds loose faces, and nothing tells whether one was lost",
+    ".iges": "IGES holds loose faces, and nothing tells whether one was lost",
 }
 
 #: Kinds that say what their unit is, FBX at times. A STEP file's is not to be overridden: it is
 #: part of each number in it, and may differ between its parts.
-WITH_UNIT = ("GLB", "glTF", "COLLADA", "STEP", "FBX")
+WITH_UNIT = ("GLB", "glTF", "COLLADA", "STEP", "FBX", "3MF")
 
 #: Kinds made of curved surfaces, which become triangles here.
 TESSELLATED = ("STEP",)
@@ -90,6 +99,7 @@ def parse(
         "OFF": parse_off,
         "COLLADA": parse_collada,
         "FBX": parse_fbx,
+        "3MF": parse_3mf,
     }
     try:
         if kind == "OBJ":

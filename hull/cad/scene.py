@@ -19,6 +19,7 @@ a ``hinge``.
 """
 
 import hashlib
+import logging
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -46,6 +47,8 @@ from hybridve.hull.cad.readers import FORMATS, TESSELLATED, WITH_UNIT
 from hybridve.hull.cad.topology import Topology, meeting_faces
 from hybridve.hull.toml_io import Name, expand_root, explain_validation, read_toml
 
+_log = logging.getLogger(__name__)
+
 #: How many metres one unit of a mesh file is.
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
@@ -55,6 +58,13 @@ _FROM_UP: dict[Up, tuple[tuple[int, int, int], tuple[float, float, float]]] = {
     "y": ((0, 2, 1), (1.0, -1.0, 1.0)),
     "x": ((1, 2, 0), (-1.0, -1.0, 1.0)),
 }
+
+#: What single precision leaves of coordinates is below this within 16 m of a file's origin, a
+#: thousandth of what outlines in pictures leave open, and of no number that is printed.
+_NO_ROUNDING_M = 1e-6
+
+#: A file is told of whose coordinates are coarser than this.
+_COARSE_M = 5e-5
 
 _Vector = tuple[float, float, float]
 
@@ -171,8 +181,9 @@ class SceneObject:
     color : tuple of 4 floats, or None
         What the file says of its colour, 0 to 1, as a picture shows it (sRGB), and its opacity.
     tessellation_error_m : float
-        How far the triangles are from the surface that the file holds: an estimate for STEP, 0 for
-        files made of triangles or polygons. Distances to the part are uncertain by that much.
+        How far the triangles are from the surface that they stand for: an estimate for STEP; for
+        files made of triangles or polygons 0, unless single precision leaves more than a micrometre
+        of their coordinates open. Distances to the part are uncertain by that much.
     about : dict
         What the report says of where it came from, as plain JSON values; see `load_scene`.
     vertices_mesh : (V, 3) float64 or None
@@ -286,6 +297,7 @@ def load_scene(path: Path) -> Scene:
     name; None for a file of one part, or merged), ``unit`` (as the scene or the file names it),
     ``unit_m`` (metres), ``up`` (the axis that was turned up), ``tessellation_m`` (largest distance
     of a triangle from the surface it stands for; None if the file is made of triangles),
+    ``rounding_m`` (how far single precision in the file may have moved a corner),
     ``n_triangles``, ``n_vertices``, ``n_zero_area``, ``n_open_edges``, ``n_nonmanifold_edges``,
     ``n_inconsistent_edges``, ``closed``, ``closed_within_m`` (0, or the noise of single precision),
     ``volume_m3`` and ``inside_out`` (these three None if not closed), and ``material`` (``name``
@@ -334,6 +346,7 @@ def load_scene(path: Path) -> Scene:
                 f"{label}.unit: this key is missing; this {cad.kind} file does not say its unit, "
                 f"and it is never guessed: one of {', '.join(UNITS_M)}"
             )
+        _tell_coarse(entry, cad, label)
         motion = _motion(entry, root, label)
         for part in _place(entry, cad, motion):
             if part.name in objects:
@@ -351,6 +364,21 @@ def load_scene(path: Path) -> Scene:
         objects=tuple(objects.values()),
         effects=tuple(entry.model_dump() for entry in parsed.effect),
         checksum=checksum.hexdigest(),
+    )
+
+
+def _tell_coarse(entry: _ObjectTable, cad: CadFile, label: str) -> None:
+    """Log that the coordinates of a file are coarse, if single precision makes them so."""
+    unit_m = UNITS_M[entry.unit] if entry.unit is not None else cad.unit_m or 1.0
+    worst = max(cad.parts, key=lambda part: part.rounding)
+    if worst.rounding * unit_m <= _COARSE_M:
+        return
+    farthest_m = float(np.abs(worst.vertices).max()) * unit_m
+    _log.warning(
+        "%s.mesh: object %r: %s: coordinates of up to %s m in single precision are off by up to "
+        "%.2g mm, which its clearances allow for; export it nearer to its origin and put it back "
+        "with translate_mm, or in double precision",
+        *(label, entry.name, cad.path, f"{farthest_m:,.0f}", 1000.0 * worst.rounding * unit_m),
     )
 
 
@@ -453,6 +481,8 @@ def _place(entry: ObjectTable, cad: CadFile, motion: Motion | None) -> Iterator[
         else:
             used = vertices_world[part.faces.ravel()]
             reference_point_world = (used.min(axis=0) + used.max(axis=0)) / 2.0
+        rounding_m = part.rounding * unit_m
+        off_by_m = part.off_by_m + (rounding_m if rounding_m > _NO_ROUNDING_M else 0.0)
         about: dict[str, Any] = {
             "object": entry.name,
             "mesh": entry.mesh,
@@ -481,7 +511,7 @@ def _place(entry: ObjectTable, cad: CadFile, motion: Motion | None) -> Iterator[
             is_closed=topology.closed,
             solid_faces=meeting_faces(part.vertices, part.faces) if topology.closed else None,
             color=part.rgba,
-            tessellation_error_m=part.off_by_m,
+            tessellation_error_m=off_by_m,
             about=about | _about_mesh(part, topology, unit_m),
             vertices_mesh=vertices_mesh,
             world_from_mesh=world_from_mesh,
@@ -495,6 +525,7 @@ def _about_mesh(part: Part, topology: Topology, unit_m: float) -> dict[str, Any]
         "n_triangles": len(part.faces),
         "n_vertices": len(part.vertices),
         "tessellation_error_m": part.off_by_m,
+        "rounding_m": part.rounding * unit_m,
         "n_polygons": part.cuts.n_polygons,
         "n_bent_polygons": part.cuts.n_bent,
         "bent_by_m": part.cuts.bent_by * unit_m,

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.cad.part import Contents, Part
+from hybridve.hull.cad.part import Contents, Part, single_rounding
 from hybridve.hull.cad.polygons import PolygonError, cut_polygons
 from hybridve.hull.cad.text import decode, number, split_lines
 
@@ -76,9 +76,10 @@ def _parse_binary(content: bytes) -> Contents:
         )
     if records is None:
         records = np.frombuffer(content, _RECORD, count, _HEAD)
-    vertices = records["corners"].astype(np.float64).reshape(-1, 3)
-    faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
-    return replace(_contents(vertices, faces), notes=notes)
+    corners = records["corners"].reshape(-1, 3)
+    faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    rounding = single_rounding(corners)
+    return replace(_contents(corners.astype(np.float64), faces, rounding), notes=notes)
 
 
 def _with_payload(content: bytes, count: int) -> NDArray[np.void] | None:
@@ -96,8 +97,11 @@ def _with_payload(content: bytes, count: int) -> NDArray[np.void] | None:
     return np.frombuffer(whole, _RECORD)
 
 
-def _contents(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> Contents:
-    return Contents((Part("", vertices, faces),) if len(faces) else ())
+def _contents(
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], rounding: float = 0.0
+) -> Contents:
+    part = Part("", vertices, faces, rounding=rounding)
+    return Contents((part,) if len(faces) else ())
 
 
 def _is_text(content: bytes) -> bool:

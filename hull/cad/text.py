@@ -5,6 +5,9 @@ import re
 #: An exponent as Fortran writes it.
 _FORTRAN = re.compile(r"^([-+]?[\d.]+)[dD]([-+]?\d+)$")
 
+#: Numbers of vertices and of anything else that is counted are below this.
+_LARGEST = 2**62
+
 _LINE_ENDS = re.compile(r"\r\n|\r|\n")
 
 #: How a text may begin that says how its characters are stored; longer marks first.
@@ -70,8 +73,8 @@ def whole(word: str) -> int:
         If it stands for none.
     """
     try:
-        if "_" not in word:
-            return int(word)
+        if "_" not in word and abs(found := int(word)) < _LARGEST:
+            return found
     except ValueError:
         pass
-    raise ValueError(f"{word!r} is no whole number; export it again")
+    raise ValueError(f"{word[:40]!r} is no whole number; export it again")

@@ -1,6 +1,8 @@
 """Meshes of polygons written as every kind of CAD file, by another hand than the readers'."""
 
+import io
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -292,6 +294,65 @@ def fbx_7500(vertices: NDArray[np.float64], polygons: Polygons) -> bytes:
     return _binary_fbx(vertices, polygons, 7500, packed=False)
 
 
+_CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+_RELATIONS = """<?xml version="1.0" encoding="UTF-8"?>
+<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">
+<Relationship Target="/3D/3dmodel.model" Id="rel0"
+ Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>
+"""
+
+
+def mesh_3mf(vertices: NDArray[np.float64], triangles: Polygons) -> str:
+    """Return the element of a mesh."""
+    points = "".join(f'<vertex x="{x!r}" y="{y!r}" z="{z!r}"/>\n' for x, y, z in vertices.tolist())
+    corners = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>\n' for a, b, c in triangles)
+    return f"<mesh><vertices>\n{points}</vertices>\n<triangles>\n{corners}</triangles></mesh>"
+
+
+def model_3mf(resources: str, build: str, unit: str = "meter", head: str = "") -> str:
+    """Return a model file."""
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<model unit="{unit}" xml:lang="en-US" '
+        f'xmlns="{_CORE}" {head}>\n<metadata name="Application">tests</metadata>\n'
+        f"<resources>\n{resources}\n</resources>\n<build>\n{build}\n</build></model>\n"
+    )
+
+
+def package_3mf(model: str, others: dict[str, str] | None = None, *, packed: bool = True) -> bytes:
+    """Return a 3MF file of its model and other files."""
+    content = io.BytesIO()
+    kind = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
+    with zipfile.ZipFile(content, "w", kind) as package:
+        package.writestr("[Content_Types].xml", "<Types/>")
+        package.writestr("_rels/.rels", _RELATIONS)
+        package.writestr("3D/3dmodel.model", model)
+        for name, text in (others or {}).items():
+            package.writestr(name, text)
+    return content.getvalue()
+
+
+def packed_3mf(vertices: NDArray[np.float64], polygons: Polygons) -> bytes:
+    """Polygons must be triangles."""
+    mesh = f'<object id="1" type="model">{mesh_3mf(vertices, polygons)}</object>'
+    return package_3mf(model_3mf(mesh, '<item objectid="1"/>'))
+
+
+def stored_3mf(vertices: NDArray[np.float64], polygons: Polygons) -> bytes:
+    """Polygons must be triangles; they stand in another file, as a component that is turned."""
+    production = "http://schemas.microsoft.com/3dmanufacturing/production/2015/06"
+    component = (
+        '<object id="8"><components><component objectid="1" p:path="/3D/Objects/o.model" '
+        'transform="0 1 0 0 0 1 1 0 0 -1 2 -3"/></components></object>'
+    )
+    # A point goes round its axes in one, and back in the other.
+    build = '<item objectid="8" transform="0 0 1 1 0 0 0 1 0 -2 3 1"/>'
+    head = f'xmlns:p="{production}" requiredextensions="p"'
+    mesh = f'<object id="1">{mesh_3mf(vertices, polygons)}</object>'
+    other = model_3mf(mesh, "", head=head)
+    model = model_3mf(component, build, head=head)
+    return package_3mf(model, {"3D/Objects/o.model": other}, packed=False)
+
+
 #: By a name that ends like the file's: how it writes, and whether it takes all polygons.
 WRITERS: dict[str, tuple[Callable[[NDArray[np.float64], Polygons], bytes], bool]] = {
     "text.stl": (text_stl, True),
@@ -309,4 +370,6 @@ WRITERS: dict[str, tuple[Callable[[NDArray[np.float64], Polygons], bytes], bool]
     "text.fbx": (text_fbx, True),
     "7400.fbx": (fbx_7400, True),
     "7500.fbx": (fbx_7500, True),
+    "packed.3mf": (packed_3mf, False),
+    "stored.3mf": (stored_3mf, False),
 }

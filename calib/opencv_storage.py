@@ -12,7 +12,11 @@ import cv2
 import numpy as np
 
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.formats.foreign import UnknownRigError
+
+
+class NotOpencvError(CalibrationError):
+    """A file is none of OpenCV's."""
+
 
 #: Maps and lists inside each other more deeply than this are no rig.
 _DEEPEST = 20
@@ -26,10 +30,8 @@ def read_storage(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    CalibrationError
-        If OpenCV cannot read the file.
-    UnknownRigError
-        If it is none of OpenCV's.
+    NotOpencvError
+        If it is none of OpenCV's, or OpenCV cannot read it.
     """
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
@@ -37,14 +39,16 @@ def read_storage(path: Path) -> dict[str, Any]:
     except (cv2.error, SystemError):
         is_open = False
     if not is_open:
-        raise UnknownRigError(
+        raise NotOpencvError(
             f"{path}: not an OpenCV file; expected XML, YAML or JSON as cv::FileStorage writes it"
         )
     try:
         root = storage.root()
         return {key: _value(root.getNode(key), 0) for key in root.keys()}  # noqa: SIM118 - no dict
     except (cv2.error, SystemError) as error:
-        raise CalibrationError(f"{path}: damaged for OpenCV, which reads it ({error})") from error
+        raise NotOpencvError(
+            f"{path}: OpenCV finds nothing under a name in it; it is damaged, or no OpenCV file"
+        ) from error
     finally:
         storage.release()
 
@@ -70,21 +74,22 @@ def _value(node: Any, depth: int) -> Any:
 
 
 def _map(node: Any, depth: int) -> Any:
-    """Return the matrix that a map stands for, or what is in it."""
-    try:
-        matrix = node.mat()
-    except cv2.error:
-        matrix = None
-    if matrix is not None:
-        return np.asarray(matrix, dtype=np.float64)
+    """Return the matrix that a map stands for, or what is in it.
+
+    OpenCV's own ``FileNode.mat`` writes beyond its memory where a damaged file says no columns.
+    """
     entries = {
         key: _value(node.getNode(key), depth + 1)
         for key in node.keys()  # noqa: SIM118 - no dict
     }
-    # ROS writes rows, cols and data, without OpenCV's sign that this is a matrix.
+    # ROS writes these three without OpenCV's sign that this is a matrix.
     data, rows, columns = (entries.get(key) for key in ("data", "rows", "cols"))
-    if isinstance(data, np.ndarray) and isinstance(rows, float) and isinstance(columns, float):
-        if data.size != rows * columns:
-            return None
-        return data.reshape(int(rows), int(columns))
-    return entries
+    if not isinstance(data, np.ndarray) or rows is None or columns is None:
+        return entries
+    if not (isinstance(rows, float) and isinstance(columns, float)):
+        return None
+    count = rows * columns
+    if data.ndim != 1 or count < 1 or data.size % count:
+        return None
+    shape = (int(rows), int(columns), data.size // int(count))  # several channels: one more axis
+    return data.reshape(shape[:2] if shape[2] == 1 else shape)
