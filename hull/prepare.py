@@ -7,6 +7,8 @@ compiled by a process beside, as it shares little with the rest.
 
 import gc
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -65,20 +67,30 @@ def prepare_kernels() -> bool:
         # The compiler leaves little that only a collection would free: a tenth of the time.
         collects = gc.isenabled()
         gc.disable()
-        beside = get_context("spawn").Process(target=_run_effects)
-        beside.start()
         try:
-            _run_kernels()
-            beside.join()
+            with _effects_beside():
+                _run_kernels()
         finally:
-            beside.kill()
             if collects:
                 gc.enable()
-        if beside.exitcode:
-            raise RuntimeError(f"what effects need was not compiled (status {beside.exitcode})")
         held = sorted(str(path.relative_to(kept)) for path in kept.rglob("*.nbc"))
         (kept / _SIGN).write_text("\n".join(held) + "\n", encoding="utf-8")
     return is_prepared()
+
+
+@contextmanager
+def _effects_beside() -> Iterator[None]:
+    """Compile what effects need in a process of its own, which is done when the block is left."""
+    beside = get_context("spawn").Process(target=_run_effects)
+    beside.start()
+    try:
+        yield
+        beside.join()
+    finally:
+        beside.kill()
+        beside.join()
+    if beside.exitcode:
+        raise RuntimeError(f"what effects need was not compiled (status {beside.exitcode})")
 
 
 def _run_kernels() -> None:

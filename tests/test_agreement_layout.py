@@ -23,7 +23,11 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("old", "new", "told"),
     [
         ("", "", None),
-        ('unit = "mm"', 'unit = "m"', '200,000 mm large, .* With unit = "mm" it were 200 mm large'),
+        (
+            'unit = "mm"',
+            'unit = "m"',
+            '200,000 mm large, .* "mm" it would be 200 mm large',
+        ),
         ('unit = "mm"', 'unit = "ft"', None),
         ('unit = "mm"', 'unit = "in"', None),
         ("[0.0, 0.0, 0.0]", "[3e6, 1e6, 0]", "3,161,... mm from where the cameras look.* far outs"),
@@ -66,4 +70,4 @@ def test_a_part_a_thousand_times_too_small_is_told(
 
     (found,) = [r.getMessage() for r in caplog.records if "object 'cube'" in r.getMessage()]
     assert "is 0.2 mm large" in found
-    assert 'With unit = "m" it were 200 mm large; here it is "mm"' in found
+    assert 'With unit = "m" it would be 200 mm large; here it is "mm"' in found

@@ -283,7 +283,6 @@ def test_corners_are_read_from_csv(tmp_path: Path, text: str) -> None:
     ("name", "text"),
     [
         ("corners.csv", "a,b\n1,2\n"),
-        ("corners.csv", "x,y\n1\n"),
         ("corners.csv", ""),
         ("corners.xml", "not xml"),
         ("corners.xml", '<?xml version="1.0"?><opencv_storage><other>1</other></opencv_storage>'),
@@ -294,6 +293,34 @@ def test_a_file_without_corners_is_named(tmp_path: Path, name: str, text: str) -
 
     with pytest.raises(CalibrationError, match=rf"{name}: no corners found"):
         read_corners(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("x,y\n1\n", "line 2: 1 cells, expected 2: x, y"),
+        ("x,y\n1,2\n\n3,four\n", "line 4: x = '3', y = 'four' is no place"),
+        ("x,y\n1,nan\n", "line 2: x = '1', y = 'nan' is no place"),
+        ("0,1.5,2\n1,3,4\n", "line 1: 3 cells, expected 2: x, y"),  # the first is no x
+        ("x;y\n1,5;2,5\n", "line 1: 'x;y' has no comma; separate columns by commas"),
+        ("id,x,y\n0,1,2\n", "a column 'id', which would be passed over; call it 'corner'"),
+        ("filename,x,y\na.png,1,2\n", "a column 'filename'.* call it 'image'"),
+        ("x,y,x\n1,2,3\n", "has the columns x, y, x; expected x and y"),
+    ],
+)
+def test_a_csv_that_would_be_misread_is_refused_with_its_place(
+    tmp_path: Path, text: str, found: str
+) -> None:
+    (tmp_path / "corners.csv").write_text(text)
+
+    with pytest.raises(CalibrationError, match=rf"corners\.csv[:,] .*{found}"):
+        read_corners(tmp_path / "corners.csv")
+
+
+def test_a_csv_as_spreadsheets_write_it_is_read(tmp_path: Path) -> None:
+    (tmp_path / "corners.csv").write_bytes("\ufeffX, Y\r\n1.5, 2\r\n3, 4\r\n,\r\n".encode())
+
+    np.testing.assert_array_equal(read_corners(tmp_path / "corners.csv"), [[2.0, 2.5], [3.5, 4.5]])
 
 
 def test_a_missing_corners_file_is_named(tmp_path: Path) -> None:

@@ -180,6 +180,11 @@ SAID_OF_CHARUCO: list[tuple[Board, str]] = [
     (replace(CHARUCO, columns=7, rows=5), "say columns = 8, rows = 6"),
     (replace(CHARUCO, first_id=30), "say first_id = 0"),
     (replace(CHARUCO, first_id=10), "say first_id = 0"),  # every other row lies as described
+    (replace(CHARUCO, rows=4), "say rows = 6"),
+    (replace(CHARUCO, columns=6, rows=4), "say columns = 8, rows = 6"),
+    (replace(CHARUCO, columns=10, rows=8), "say columns = 8, rows = 6"),
+    (replace(CHARUCO, first_id=4), "say first_id = 0"),  # two rows on
+    (replace(CHARUCO, first_id=1), "say first_id = 0"),  # two squares on
 ]
 
 
@@ -192,6 +197,36 @@ def test_a_charuco_board_is_named_for_what_it_is(
 
     assert seen is not None
     assert seen.endswith(told)
+
+
+@pytest.mark.parametrize("first_row", [0, 1])
+def test_a_grid_of_tags_that_goes_on_is_not_the_one_described(
+    april: NDArray[np.uint8], first_row: int
+) -> None:
+    said = replace(APRIL, rows=1, first_id=APRIL.columns * first_row)
+
+    assert APRIL.detect(april, "usual").corners is not None
+    assert "which go on beyond it" in said.detect(april, "quick").how
+    assert said.detect(april, "quick").corners is None
+
+
+@pytest.mark.parametrize(("rows", "is_told"), [(8, True), (6, False)])
+def test_rows_that_were_in_view_and_never_seen_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, rows: int, is_told: bool
+) -> None:
+    camera = camera_of(size_px=(640, 480))
+    for number, tilt_deg in enumerate((-15.0, 5.0, 20.0)):
+        sheet = charuco_sheet(CHARUCO), facing(CHARUCO, 1.2, tilt_deg)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), render_sheets(camera, [sheet], 2.0, samples=2))
+    taken = CameraInput("cam", "SIMPLE_RADIAL", None, open_source(tmp_path, "*.png"))
+
+    observe_boards([replace(CHARUCO, rows=rows)], [taken], SETTINGS)
+
+    told = [record.getMessage() for record in caplog.records if "never seen" in record.message]
+    assert len(told) == is_told
+    if is_told:
+        assert "rows = 8, but its lowest 2 were never seen" in told[0]
+        assert "in 3 of 3 pictures: if it has fewer, say rows = 6" in told[0]
 
 
 def test_markers_that_are_counted_from_another_number_are_told() -> None:

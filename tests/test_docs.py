@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from hybridve.calib.boards.corners_io import COLUMNS
+from hybridve.calib.boards.corner_files import COLUMNS
 from hybridve.hull.cad.scene import HingeTable, ObjectTable, TrackTable
 from hybridve.hull.capture.segment import SegmentSettings
 from hybridve.hull.capture.session_tables import TARGETS, CameraTable, SessionTable, WorldPoint

@@ -6,9 +6,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.mesh_files import binary_stl
 from helpers.sessions import write_ball_session, write_cube_scene
 from numpy.typing import NDArray
 
+from hybridve.hull.cad.mesh import read_cad
 from hybridve.hull.report.read import read_points, read_report
 
 Run = Callable[..., int]
@@ -73,3 +75,30 @@ def test_nothing_is_lost_far_from_the_origin(
         np.testing.assert_allclose(stored_m + (origin_m - shift), expected_m, atol=5e-6)
         shown_m = file["VTKHDF/hit_points/Points"][:]
         np.testing.assert_array_equal(shown_m, stored_m)
+
+
+@pytest.mark.slow
+def test_what_single_precision_leaves_of_a_file_is_in_the_bounds(run: Run, tmp_path: Path) -> None:
+    """Of a part that is drawn 5 km off its origin, and put back: a quarter of a millimetre."""
+    away_mm = 5_000_000.24
+    session = write_ball_session(tmp_path / "session", CENTERS[:1])
+    scene = write_cube_scene(tmp_path, {"exact": (0.0, 0.0, 0.0)})
+    (part,) = read_cad(tmp_path / "cube.obj").parts
+    content = binary_stl(part.vertices + np.array([away_mm, 0.0, 0.0]), part.faces.tolist())
+    (tmp_path / "coarse.stl").write_bytes(content)
+    with scene.open("a", encoding="utf-8") as file:
+        file.write(
+            '\n[[object]]\nname = "coarse"\nmesh = "coarse.stl"\nunit = "mm"\n'
+            f"translate_mm = [{-away_mm}, 0, 0]\n"
+        )
+    path = tmp_path / "report.h5"
+
+    assert run("detect", session, "--scene", scene, "-o", path, "--no-progress") == 0
+
+    objects = read_report(path).objects
+    exact_m, coarse_m = (objects[name]["clearance_m"][0] for name in ("exact", "coarse"))
+    assert np.ptp(exact_m) < 2e-4
+    # Its corners moved by 0.24 mm towards the ball or away from it, all alike.
+    assert coarse_m[0] <= exact_m[0]
+    assert exact_m[1] <= coarse_m[1]
+    assert np.ptp(coarse_m) < 1e-3

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numba
@@ -201,11 +202,43 @@ def test_after_preparing_detect_compiles_nothing(
     assert names >= {"native", "certify", "segment", "background"}
 
 
+#: Runs what set-up runs, and prints what was compiled for more than one kind of argument.
+_SIGNATURES = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from hybridve.hull import prepare
+prepare._run_kernels()
+prepare._run_effects()
+found = {
+    id(one): (len(one.signatures), f"{name}.{key}")
+    for name, module in list(sys.modules.items()) if name.startswith("hybridve.")
+    for key, one in vars(module).items() if isinstance(one, Dispatcher)
+}
+assert sum(count > 0 for count, _ in found.values()) > 100
+print(*sorted(name for count, name in found.values() if count > 1))
+"""
+
+
+@pytest.mark.slow
+def test_no_function_is_compiled_for_more_than_one_kind_of_argument(
+    prepared: tuple[Path, dict[str, str]],
+) -> None:
+    # Two processes that compile one function for different types would take each other's code;
+    # set-up compiles in two.
+    shown = subprocess.run(
+        [sys.executable, "-c", _SIGNATURES], env=prepared[1], capture_output=True, text=True
+    )
+
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.split() == []
+
+
 def test_nothing_is_compiled_that_is_done_or_would_not_be_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = []
     monkeypatch.setattr(prepare, "_run_kernels", lambda: runs.append(gc.isenabled()))
+    monkeypatch.setattr(prepare, "_effects_beside", nullcontext)
     monkeypatch.setattr(prepare, "folder", lambda: None)
     assert not prepare.prepare_kernels()
     assert runs == []

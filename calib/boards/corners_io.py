@@ -11,7 +11,6 @@ name no image, hold the points of one board in the extrinsic clip, see `read_cor
 All of them are understood as OpenCV counts: the centre of the top-left pixel is at (0, 0).
 """
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board
-from hybridve.calib.boards.corner_files import read_corners
+from hybridve.calib.boards.corner_files import columns_of, csv_lines, read_corners
 from hybridve.calib.boards.markers import Charuco
 from hybridve.calib.boards.target import Chessboard, fit_homography, list_corners
 from hybridve.calib.errors import CalibrationError
-
-#: What the columns of a CSV of points may be.
-COLUMNS = ("image", "frame", "board", "corner", "x", "y")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,24 +110,11 @@ def _rows_of_table(path: Path) -> list[tuple[int, dict[str, str]]] | None:
     """Return lines with their numbers; None if the file says no more than x and y."""
     if path.suffix.lower() not in {".csv", ".txt"} or not path.is_file():
         return None
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            lines = [
-                (reader.line_num, [cell.strip() for cell in line])
-                for line in reader
-                if line and not line[0].startswith("#")
-            ]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise CalibrationError(f"{path}: not a CSV file: {error}") from error
+    lines = csv_lines(path)
     header = [cell.lower() for cell in lines[0][1]] if lines else []
     if not {"image", "frame", "board", "corner"} & set(header):
         return None
-    if "x" not in header or "y" not in header:
-        raise CalibrationError(
-            f"{path}: has the columns {', '.join(header)}; expected x and y, and perhaps "
-            f"{', '.join(COLUMNS[:4])}"
-        )
+    columns_of(path, header)
     for number, line in lines[1:]:
         if len(line) != len(header):
             raise CalibrationError(

@@ -19,7 +19,7 @@ from hybridve.calib.boards.pattern import (
     homographies,
     mapped,
 )
-from hybridve.calib.boards.target import grey_of
+from hybridve.calib.boards.target import fit_homography, grey_of
 
 _Grey = TypeVar("_Grey", np.uint8, np.float32)
 
@@ -60,6 +60,17 @@ _LINK_TOLERANCE_PX = 1.5
 #: A group of markers that others contradict is the board if it has this share of those read: every
 #: other row of a board whose markers are counted from a wrong number lies as described.
 _LEAST_SHARE = 0.6
+
+
+#: So many markers are no accident: in the rows that would come before the first or after the last,
+#: or together in another place than the rest of the board.
+_NO_ACCIDENT = 3
+
+#: They lie where such rows would if they are this near, of their sides.
+_BEYOND_TOLERANCE = 0.35
+
+#: Places beyond the board are predicted from this many corners of its markers, the nearest.
+_NEAREST = 24
 
 
 @lru_cache(maxsize=8)
@@ -131,7 +142,7 @@ def _read(
             if best is not None:
                 break
             border_bits = pattern.border_bits
-            members, quads_px = _read_markers(image, dictionary, pattern)
+            members, quads_px, ids_beyond, beyond_px = _read_markers(image, dictionary, pattern)
         most = max(most, len(members))
         chosen, fitting = _link(pattern, members, quads_px)
         if len(chosen) >= 2 and (best is None or fitting > best[0]):
@@ -142,6 +153,13 @@ def _read(
             said += ", which do not lie as on it"
         return None, None, said
     _, pattern, members, found_px = best
+    further = _go_on(pattern, members, found_px, ids_beyond, beyond_px)
+    if len(further) >= _NO_ACCIDENT:
+        return (
+            None,
+            None,
+            f"{said}, which go on beyond it (marker {further[0]} is seen in the next row)",
+        )
     quads, quads_px = pattern.quads[members], (found_px + 0.5) / exact
     plane, pixels = quads.reshape(-1, 2), quads_px.reshape(-1, 2)
     sides, sides_px = (
@@ -163,22 +181,58 @@ def _own_dictionary(name: str, first_id: int, count: int) -> Any:
 
 def _read_markers(
     image: NDArray[np.uint8], dictionary: str, pattern: Pattern
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the board's markers in an image: indices (M,), corners (M, 4, 2), centres at 0."""
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.intp], NDArray[np.float64]]:
+    """Return the board's markers in an image: indices (M,), corners (M, 4, 2), centres at 0.
+
+    And of those beyond it numbers (B,) and corners (B, 4, 2).
+    """
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = pattern.border_bits
     parameters.detectInvertedMarker = True
     parameters.minMarkerPerimeterRate = min(0.03, 4 * _MARKER_PX / max(image.shape))
     none = np.zeros(0, np.intp), np.zeros((0, 4, 2))
     if min(image.shape) < 4 * _MARKER_PX:
-        return none
-    own = _own_dictionary(dictionary, int(pattern.ids[0]), len(pattern.ids))
+        return *none, *none
+    looked_for = np.concatenate([pattern.ids, pattern.ids_beyond])
+    first = int(looked_for.min())
+    own = _own_dictionary(dictionary, first, int(looked_for.max()) - first + 1)
     detector = cv2.aruco.ArucoDetector(own, parameters)
     found: tuple[Any, ...] = detector.detectMarkers(image)
-    corners, ids, _ = found
-    if ids is None or len(ids) == 0:
-        return none
-    return np.asarray(ids, np.intp).ravel(), np.asarray(corners, np.float64).reshape(-1, 4, 2)
+    corners, indices, _ = found
+    if indices is None or len(indices) == 0:
+        return *none, *none
+    ids = np.asarray(indices, np.intp).ravel() + first
+    quads_px = np.asarray(corners, np.float64).reshape(-1, 4, 2)
+    members = ids - int(pattern.ids[0])
+    inside = (members >= 0) & (members < len(pattern.ids))
+    return members[inside], quads_px[inside], ids[~inside], quads_px[~inside]
+
+
+def _go_on(
+    pattern: Pattern,
+    members: NDArray[np.intp],
+    quads_px: NDArray[np.float64],
+    ids: NDArray[np.intp],
+    ids_px: NDArray[np.float64],
+) -> list[int]:
+    """Return which markers lie in the rows that would come before the first or after the last."""
+    plane = pattern.quads[members].reshape(-1, 2)
+    pixels = quads_px.reshape(-1, 2)
+    places = dict(zip(pattern.ids_beyond.tolist(), pattern.quads_beyond, strict=True))
+    further = []
+    for number, quad_px in zip(ids.tolist(), ids_px, strict=True):
+        quad = places.get(number)
+        if quad is None:
+            continue
+        nearest = np.argsort(np.linalg.norm(plane - quad.mean(axis=0), axis=1))[:_NEAREST]
+        img_from_plane = fit_homography(plane[nearest], pixels[nearest])
+        if img_from_plane is None:
+            continue
+        side_px = float(np.linalg.norm(quad_px - np.roll(quad_px, 1, axis=0), axis=1).mean())
+        off_px = np.linalg.norm(mapped(img_from_plane[None], quad[None])[0] - quad_px, axis=1)
+        if off_px.mean() < _BEYOND_TOLERANCE * side_px:
+            further.append(number)
+    return sorted(set(further))
 
 
 def _link(
@@ -219,7 +273,10 @@ def _link(
     against = np.zeros(len(members), bool)
     against[second[~agree & inside[first]]] = True
     against[first[~agree & inside[second]]] = True
-    contrary = int((against & ~inside).sum())
+    elsewhere = against & ~inside
+    contrary = int(elsewhere.sum())
+    if contrary and np.bincount(group[elsewhere]).max() >= _NO_ACCIDENT:
+        return nobody  # together in another place: the rows begin with another number
     is_most = inside.sum() >= _LEAST_SHARE * len(np.unique(members))
     if contrary > inside.sum() or (contrary and not is_most):
         return nobody

@@ -30,6 +30,9 @@ from hybridve.calib.boards.symmetry import SYMMETRY_REACH
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose
 
+#: Rows of markers that are looked for above the first and below the last.
+_ROWS_BEYOND = 2
+
 #: The dictionaries of markers, by OpenCV's names.
 DICTIONARIES = tuple(
     sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_") and not name.endswith("H"))
@@ -296,20 +299,31 @@ def _charuco_pattern(board: Charuco, legacy: bool) -> Pattern:
         sign[in_white & (depth >= ring)] = 0.0
         return np.where(((square >= 0) & (square < (columns, rows))).all(axis=1), sign, 0.0)
 
-    squares = _grid(columns, rows)
+    squares = _grid(columns, rows + 2 * _ROWS_BEYOND) - (0, _ROWS_BEYOND)
     squares = squares[squares.sum(axis=1) % 2 == white]
+    on_board = (squares[:, 1] >= 0) & (squares[:, 1] < rows)
+    ids = board.first_id + np.arange(len(squares)) - int(np.argmax(on_board))
     top_left = np.column_stack([squares[:, 0] - 1.0, rows - 1.0 - squares[:, 1]])
     corners = np.array([[0, 0], [1, 0], [1, -1], [0, -1]]) * side + (margin, -margin)
+    quads = top_left[:, None] + corners
+    beyond = ~on_board & _exist(ids, board.dictionary)
     points = _grid(columns - 1, rows - 1)
     return Pattern(
         label="" if rows % 2 else ("old pattern" if legacy else "new pattern"),
         points=points,
-        ids=board.first_id + np.arange(len(squares)),
-        quads=top_left[:, None] + corners,
+        ids=ids[on_board],
+        quads=quads[on_board],
         reach=3.0,
         signs=around(points, sign_at),
         border_bits=1,
+        ids_beyond=ids[beyond],
+        quads_beyond=quads[beyond],
     )
+
+
+def _exist(ids: NDArray[np.intp], dictionary: str) -> NDArray[np.bool_]:
+    """Return which numbers a dictionary has."""
+    return np.asarray((ids >= 0) & (ids < len(dictionary_of(dictionary).bytesList)))
 
 
 @lru_cache(maxsize=16)
@@ -332,6 +346,10 @@ def _april_pattern(board: AprilGrid, border_bits: int) -> Pattern:
     points = board.points_board[:, :2] / cell_m
     # OpenCV's markers are Kalibr's upside down.
     quads = points.reshape(-1, 4, 2)[:, [1, 0, 3, 2]]
+    places = _grid(board.columns, board.rows + 2 * _ROWS_BEYOND) - (0, _ROWS_BEYOND)
+    ids = board.first_id + (places @ (1, board.columns)).astype(np.intp)
+    outside = (places[:, 1] < 0) | (places[:, 1] >= board.rows)
+    beyond = outside & _exist(ids, board.dictionary)
     return Pattern(
         label=f"borders of {border_bits}",
         points=points,
@@ -340,5 +358,7 @@ def _april_pattern(board: AprilGrid, border_bits: int) -> Pattern:
         reach=2.3 * pitch,
         signs=around(points, sign_at),
         border_bits=border_bits,
+        ids_beyond=ids[beyond],
+        quads_beyond=quads[0] + pitch * places[beyond][:, None],
         doubt=": are there no black squares between the tags' corners?",
     )

@@ -65,6 +65,9 @@ class Pattern:
         -1 black, 0 unknown.
     border_bits : int
         How thick the markers' black border is.
+    ids_beyond, quads_beyond : (B,) intp, (B, 4, 2) float64
+        The same of the rows that would come before the first and after the last, if there were
+        more: where they are seen, the board is larger, or counted from another number.
     doubt : str
         What may be the matter where markers are read and no points are found at them.
     """
@@ -76,6 +79,8 @@ class Pattern:
     reach: float
     signs: NDArray[np.float64]
     border_bits: int
+    ids_beyond: NDArray[np.intp]
+    quads_beyond: NDArray[np.float64]
     doubt: str = ""
 
 

@@ -28,6 +28,9 @@ _SIZE_PX = 1200
 #: Markers of one family in one picture that are no accident.
 _LEAST_MARKERS = 5
 
+#: Places so near the edge of a picture, in its sides, may be outside of it.
+_MARGIN = 0.05
+
 #: Dictionaries of so many markers are looked through, where a family has a smaller one.
 _COMMON = 250
 
@@ -142,7 +145,10 @@ def _marker_boards(board: _Known, grey: NDArray[np.uint8]) -> Iterator[Charuco |
             layout = _layout(board, read) if len(read.ids) >= _LEAST_MARKERS else None
             if layout is None:
                 continue
-            for rows in _rows(board, layout, int(read.ids.max()) - layout.first_id + 1):
+            rows_tried = _rows(board, layout, int(read.ids.max()) - layout.first_id + 1)
+            if layout.columns != board.columns:  # rows as described may be covered
+                rows_tried = _not_ended(layout, read, rows_tried, grey.shape)
+            for rows in rows_tried:
                 made = _made(board, layout, dictionary, rows)
                 if made is not None:
                     yield made
@@ -279,6 +285,33 @@ def _rows(board: _Known, layout: _Layout, count: int) -> list[int]:
         likely.append(board.columns)
     rows = [number for number in likely if number >= least]  # the rest may be out of view
     return list(dict.fromkeys([*rows, least, least + 1]))
+
+
+def _not_ended(
+    layout: _Layout, read: _Read, rows_tried: list[int], size: tuple[int, ...]
+) -> list[int]:
+    """Return numbers of rows without those of which the picture shows that they are too many.
+
+    Markers of further rows would be in the picture, and none of them is read.
+    """
+    numbers = read.ids - layout.first_id
+    places = _places(numbers, layout.is_charuco, layout.columns, layout.is_offset)
+    matrix, _ = cv2.findHomography(places, _middles(read.quads_px), cv2.RANSAC, 5.0)
+    if matrix is None:
+        return rows_tried
+    left = []
+    for rows in rows_tried:
+        count = layout.columns * rows // (2 if layout.is_charuco else 1)
+        further = np.arange(int(numbers.max()) + 1, count, dtype=np.intp)
+        flat = _places(further, layout.is_charuco, layout.columns, layout.is_offset)
+        mapped = flat @ matrix[:, :2].T + matrix[:, 2]
+        ahead = mapped[:, 2] > 0
+        at = mapped[ahead, :2] / mapped[ahead, 2:]
+        margin = _MARGIN * np.array(size[1::-1])
+        in_picture = ((at > margin) & (at < np.array(size[1::-1]) - margin)).all(axis=1)
+        if in_picture.sum() < _LEAST_MARKERS - 1:
+            left.append(rows)
+    return left or rows_tried
 
 
 def _made(board: _Known, layout: _Layout, family: str, rows: int) -> Charuco | AprilGrid | None:

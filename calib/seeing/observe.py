@@ -14,9 +14,11 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hybridve.calib.boards.board import Board, Observations
-from hybridve.calib.boards.target import Chessboard
+from hybridve.calib.boards.board import Board, Observations, Sighting, is_seen
+from hybridve.calib.boards.markers import AprilGrid, Charuco
+from hybridve.calib.boards.target import Chessboard, fit_homography
 from hybridve.calib.camera import N_PARAMS
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.seeing.clip import observe_clips
@@ -30,6 +32,11 @@ logger = logging.getLogger(__name__)
 
 
 _DEFAULTS = ObserveSettings()
+
+#: In so many pictures, rows that are not seen are no accident; well inside one is so far from its
+#: edges, in its sides.
+_NO_ACCIDENT = 3
+_MARGIN = 0.1
 
 
 def observe_boards(
@@ -78,6 +85,7 @@ def observe_boards(
         for camera, still, clip in zip(cameras, stills, clips, strict=True)
     ]
     _refuse_larger(boards, seen)
+    _tell_rows_without_marker(boards, seen)
     return seen
 
 
@@ -176,6 +184,54 @@ def _refuse_larger(boards: Sequence[Board], seen: Sequence[Observations]) -> Non
             f"{board.rows + more_rows} inner corners; say columns = {board.columns + more_columns} "
             f"and rows = {board.rows + more_rows}"
         )
+
+
+def _tell_rows_without_marker(boards: Sequence[Board], seen: Sequence[Observations]) -> None:
+    """Log that rows at an end of a marker board were never seen, though they were in view.
+
+    The board may have fewer rows than described; its frame, from which the world may be measured,
+    begins at the bottom left, elsewhere then.
+    """
+    for number, board in enumerate(boards):
+        if not isinstance(board, Charuco | AprilGrid):
+            continue
+        views = [(one, each.size_px) for each in seen for one in each.sightings]
+        views = [(one, size_px) for one, size_px in views if one.board == number]
+        if not views:
+            continue
+        heights, row_of = np.unique(board.points_board[:, 1].round(9), return_inverse=True)
+        some = np.any([is_seen(one.pixels) for one, _ in views], axis=0)
+        rows_seen = np.unique(row_of[some])
+        below, above = int(rows_seen.min()), int(len(heights) - 1 - rows_seen.max())
+        lines_a_row = 2 if isinstance(board, AprilGrid) else 1
+        missing = (below + above) // lines_a_row
+        hidden = (row_of < below) | (row_of > rows_seen.max())
+        in_view = sum(_are_in_view(board, one, hidden, size_px) for one, size_px in views)
+        if missing and in_view >= _NO_ACCIDENT and 2 * in_view >= len(views):
+            which = f"board {board.name!r}" if len(boards) > 1 else "the board"
+            logger.warning(
+                "%s has rows = %d, but its %s %d were never seen, and would have been in view in "
+                "%d of %d pictures: if it has fewer, say rows = %d; its origin, the bottom left, "
+                "is elsewhere then",
+                *(which, board.rows, "lowest" if below else "highest", missing),
+                *(in_view, len(views), board.rows - missing),
+            )
+
+
+def _are_in_view(
+    board: Board, one: Sighting, hidden: NDArray[np.bool_], size_px: tuple[int, int]
+) -> bool:
+    """Whether points of a board that a picture does not show would be well inside of it."""
+    shown = is_seen(one.pixels)
+    plane = board.points_board[:, :2] / board.square_m
+    img_from_board = fit_homography(plane[shown], one.pixels[shown])
+    if img_from_board is None or not hidden.any():
+        return False
+    mapped = plane[hidden] @ img_from_board[:, :2].T + img_from_board[:, 2]
+    if (mapped[:, 2] <= 0).any():
+        return False
+    share = mapped[:, :2] / mapped[:, 2:] / size_px
+    return bool(((share > _MARGIN) & (share < 1.0 - _MARGIN)).all())
 
 
 def _check_inputs(cameras: Sequence[CameraInput]) -> None:

@@ -102,8 +102,8 @@ def _unit_question(one: SceneObject, size_m: float, reach_m: float) -> str:
     usual = [unit for unit in fitting if unit in ("mm", "m")] or fitting
     likely = min(usual, key=lambda unit: abs(np.log(sizes_m[unit] / (_LIKELY * reach_m))))
     return (
-        f'is its unit right? With unit = "{likely}" it were {_mm(sizes_m[likely])} large; here it '
-        f'is "{one.about.get("unit")}"'
+        f'is its unit right? With unit = "{likely}" it would be {_mm(sizes_m[likely])} large; here '
+        f'it is "{one.about.get("unit")}"'
     )
 
 

@@ -367,7 +367,7 @@ def load_scene(path: Path) -> Scene:
     )
 
 
-def _tell_coarse(entry: _ObjectTable, cad: CadFile, label: str) -> None:
+def _tell_coarse(entry: ObjectTable, cad: CadFile, label: str) -> None:
     """Log that the coordinates of a file are coarse, if single precision makes them so."""
     unit_m = UNITS_M[entry.unit] if entry.unit is not None else cad.unit_m or 1.0
     worst = max(cad.parts, key=lambda part: part.rounding)

@@ -99,9 +99,9 @@ def _into(
 
 @compiled
 def _out_of(
-    own: NDArray[np.float64], cad: Cad, one: int, end: int, point: NDArray[np.float64]
+    own: NDArray[np.float64], cad: Cad, one: int, end: float, point: NDArray[np.float64]
 ) -> None:
-    """Write a point of an object's own frame in the local one, as the step begins or, 1, ends."""
+    """Write a point of an object's own frame in the local one, as the step begins or, 1.0, ends."""
     for axis in range(3):
         point[axis] = 0.0
         for row in range(3):  # p = R' (own - t)
@@ -214,7 +214,7 @@ def cad_speed(
     own, there, speed = np.zeros(3), np.zeros(3), 0.0
     _into(point, cad, one, share, own)
     for end in range(2):
-        _out_of(own, cad, one, end, there)
+        _out_of(own, cad, one, float(end), there)
         for axis in range(3):
             speed += (2.0 * end - 1.0) * there[axis] * normal[axis]
     return speed / cad.step_s
@@ -225,4 +225,4 @@ def carry(point: NDArray[np.float64], one: int, share: float, cad: Cad) -> None:
     """Take a point, local frame, along with an object from a share of the step to its end."""
     own = np.zeros(3)
     _into(point, cad, one, share, own)
-    _out_of(own, cad, one, 1, point)
+    _out_of(own, cad, one, 1.0, point)

@@ -448,7 +448,7 @@ def renew(
         for corner in range(3):
             if kept_sample[t, corner] < 0:
                 continue
-            _write_weights(viewports[t], kept_sample[t, corner], weights[n])
+            _write_weights(viewports[t], kept_sample[t, corner] + ZERO, weights[n])
             way[n] = kept_way[t, corner]
             at_m = 0.0
             point[:] = origin - _NEAR_M * way[n]
@@ -547,7 +547,7 @@ def push_hits(
     deepest_m = 0.0
     for k in range(count):
         t = triangle[k]
-        _write_weights(viewports[t], sample[k], weights[k])
+        _write_weights(viewports[t], sample[k] + ZERO, weights[k])
         free = 0.0
         about[:] = 0.0
         point[:] = origin

@@ -25,7 +25,7 @@ class DrawnObject:
     hit_points_world : (P, 3) float64
         The collision points, in metres.
     share_lit : (T,) float or None
-        Of each triangle how much of it a lamp of the scene reaches: what it does not is drawn darker.
+        Of each triangle how much of it a lamp of the scene reaches: the rest is drawn darker.
     """
 
     name: str
