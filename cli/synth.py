@@ -52,7 +52,7 @@ def synth(
       boxes    an arm, a ball and a carton among four parts
       payload  a pipe and a cord between two payloads: how much room do they need?
       ball     blocks about a virtual ball
-      curtain  two hands that push at a curtain in a window
+      curtain  two hands that part a curtain in a window
       bounce   a virtual ball among real blocks
 
     \b

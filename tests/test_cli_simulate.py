@@ -11,6 +11,7 @@ import pytest
 from helpers.motions import angles_csv
 from helpers.sessions import write_ball_session, write_cube_scene
 from scipy.spatial.transform import Rotation
+from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from hybridve.calib.pose import placed
 from hybridve.hull.effects.instants import instants
@@ -283,6 +284,11 @@ def test_cad_that_moves_is_met_told_of_drawn_and_paused_without_a_pose(
         np.testing.assert_allclose(there, expected, atol=1e-9)
         told = found.groups["board.proximity"].values["vertices_m"][frame]
         np.testing.assert_allclose(told, expected, atol=1e-9)
+        (drawn,) = (one for one in drawn_objects(found, frame) if one.name == "board")
+        np.testing.assert_allclose(drawn.vertices_world, expected, atol=1e-9)
+        np.testing.assert_allclose(shown_by_vtk(whole, "board", frame), expected, atol=1e-6)
+    assert "board" not in [one.name for one in drawn_objects(found, 4)]
+    assert len(shown_by_vtk(whole, "board", 4)) == 0
     box = found.groups["box"].values
     assert box["velocity_m_s"][-1, 1] > 0.5
     assert box["cad_work_j"][-1] > 0.0
@@ -304,6 +310,22 @@ def test_cad_that_moves_is_met_told_of_drawn_and_paused_without_a_pose(
         assert len(columns) > 40
         for key, values in columns.items():
             np.testing.assert_array_equal(values, other[key][()], err_msg=key)
+
+
+def shown_by_vtk(path: Path, name: str, step: int) -> np.ndarray:
+    """Return the points (V, 3) that VTK shows of an object in a step, in the world."""
+    with h5py.File(path) as file:
+        label = next(key for key, one in file["VTKHDF"].items() if one.attrs.get("object") == name)
+        index = int(file["VTKHDF"][label].attrs["Index"])
+        origin_m = file["hybridve/settings/local_origin_m"][:]
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    reader.SetStep(step)
+    reader.Update()
+    blocks = reader.GetOutputDataObject(0)
+    shown = blocks.GetPartition(index, 0)
+    xyz_m = np.array([shown.GetPoint(i) for i in range(shown.GetNumberOfPoints())])
+    return np.asarray(xyz_m.reshape(-1, 3) + origin_m)
 
 
 def datasets(file: h5py.File) -> dict[str, np.ndarray]:

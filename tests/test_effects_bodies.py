@@ -421,6 +421,14 @@ def test_it_goes_on_from_a_state_to_the_bit() -> None:
     assert whole.told[-1]["ball"]["n_contacts"] > 0, "it would prove too little"
 
 
+def test_poses_are_places_that_a_file_holds_about_its_origin() -> None:
+    played = stage(far(), [ball("ball", [0, 0, 0])], [rigid("ball")])
+
+    (pose,) = (one for one in played.effect.told["ball"].columns if one.shape == (3, 4))
+
+    assert pose.is_place
+
+
 def test_what_is_not_finite_is_named() -> None:
     played = stage(far(), [ball("ball", [0, 0, 0.1])], [rigid("ball")])
     state = dict(played.effect.state())

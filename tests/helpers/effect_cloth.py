@@ -1,6 +1,6 @@
 """Sheets, hulls in motion and the least driver for tests of the effect "cloth"."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -66,20 +66,29 @@ def make_cloth(
     *,
     engine: Engine | None = None,
     step_s: float = STEP_S,
+    names: Sequence[str] = ("sheet",),
     **keys: Any,
 ) -> Cloths:
-    """Return the effect on the object "sheet"."""
-    table = KIND.table.model_validate({"kind": "cloth", "object": "sheet", **keys})
-    scene = Scene(Path("scene.toml"), tuple(objects), (table.model_dump(),), "")
+    """Return the effect on some objects."""
+    tables = [
+        KIND.table.model_validate({"kind": "cloth", "object": name, **keys}) for name in names
+    ]
+    scene = Scene(
+        Path("scene.toml"), tuple(objects), tuple(table.model_dump() for table in tables), ""
+    )
     setting = Setting(
         scene=scene,
-        claimed=frozenset(table.claimed),
+        claimed=frozenset(names),
         views=views,
         engine=engine or Native(1),
         step_s=step_s,
         frame_s=1 / 60,
     )
-    effect = KIND.make([Entry("sheet", table, "scene.toml: effect.1")], setting)
+    entries = [
+        Entry(name, table, f"scene.toml: effect.{number}")
+        for number, (name, table) in enumerate(zip(names, tables, strict=True), start=1)
+    ]
+    effect = KIND.make(entries, setting)
     assert isinstance(effect, Cloths)
     return effect
 

@@ -1,7 +1,8 @@
-"""The preset "curtain": two hands that push at a virtual curtain, as in figure 4 of the paper.
+"""The preset "curtain": two hands that part a virtual curtain, as in figure 4 of the paper.
 
-The curtain hangs in folds before a window frame: an open sheet of 720 triangles and 399 vertices,
-as many as the paper's. It gives way along y, away from the person.
+The curtain hangs in folds before a window frame, in two panels that meet in the middle: open sheets
+of 720 triangles together, as many as the paper's, and 420 vertices. Each gives way to its own side:
+the hands come in between the two and draw apart.
 """
 
 from hybridve.calib.pose import compose
@@ -20,6 +21,9 @@ from hybridve.hull.synth.stage import Actor, CadPart, Preset, Stage, pose_at
 #: The middle of the window, metres.
 _MIDDLE = (0.37, 0.26, 0.72)
 
+#: How wide each panel is, and half the gap between the two, millimetres.
+_WIDTH_MM, _GAP_MM = 376.0, 4.0
+
 
 def make_stage() -> Stage:
     """Return the stage."""
@@ -37,14 +41,8 @@ def make_stage() -> Stage:
         lamp=LAMP,
         actors=hands,
         parts=(
-            CadPart(
-                "curtain",
-                sheet_mesh((760.0, 840.0), (18, 20), 12.0, 3),
-                (mm[0], mm[1], mm[2]),
-                recovery_direction=(0.0, 1.0, 0.0),
-                comment="An open sheet: it has no inside. It gives way along y only.",
-                effect='kind = "cloth"\nobject = "curtain"\nareal_density_kg_m2 = 0.2\npin = "top"',
-            ),
+            _panel("curtain_left", -1.0),
+            _panel("curtain_right", 1.0),
             CadPart(
                 "window",
                 frame_mesh((880.0, 50.0, 960.0), 50.0, 60.0),
@@ -55,6 +53,19 @@ def make_stage() -> Stage:
     )
 
 
+def _panel(name: str, side: float) -> CadPart:
+    """Return the panel on one side, 1 for right."""
+    x, y, z = (1000.0 * value for value in _MIDDLE)
+    return CadPart(
+        name,
+        sheet_mesh((_WIDTH_MM, 840.0), (9, 20), 12.0, 2),
+        (x + side * (_GAP_MM + _WIDTH_MM / 2.0), y, z),
+        recovery_direction=(side, 0.0, 0.0),
+        comment="An open sheet: it has no inside. It gives way to its own side only.",
+        effect=f'kind = "cloth"\nobject = "{name}"\nareal_density_kg_m2 = 0.2\npin = "top"',
+    )
+
+
 def _hand(name: str, side: float) -> Actor:
     """Return a hand on one side, 1 for right: on edge, its back outwards, the fingers lead."""
     x, y, z = _MIDDLE
@@ -62,10 +73,12 @@ def _hand(name: str, side: float) -> Actor:
         tuple(
             Key(moment, (x + side * out, y + along, z + up), (0.0, side * 82.0, -side * turn))
             for moment, out, along, up, turn in (
-                (0.00, 0.08, -0.52, -0.12, 4.0),
-                (0.28, 0.05, 0.07, -0.05, 0.0),
-                (0.58, 0.20, 0.11, -0.02, 12.0),
-                (0.78, 0.22, -0.26, -0.06, 8.0),
+                (0.00, 0.07, -0.52, -0.12, 4.0),
+                (0.22, 0.022, 0.02, -0.05, 0.0),
+                (0.30, 0.022, 0.07, -0.04, 0.0),
+                (0.56, 0.24, 0.09, -0.02, 10.0),
+                (0.70, 0.25, 0.09, -0.02, 10.0),
+                (0.84, 0.24, -0.26, -0.06, 8.0),
                 (1.00, 0.10, -0.55, -0.14, 4.0),
             )
         )
@@ -79,7 +92,7 @@ def _hand(name: str, side: float) -> Actor:
 
 #: The recording.
 CURTAIN = Preset(
-    description="Two hands push at a virtual curtain in a window, and withdraw.",
+    description="Two hands part a virtual curtain in a window, and withdraw.",
     n_frames=48,
     fps=25.0,
     make_stage=make_stage,
