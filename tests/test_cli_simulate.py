@@ -15,6 +15,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from hybridve.calib.pose import placed
 from hybridve.hull.effects.instants import instants
+from hybridve.hull.query.silhouettes import make_hull, make_views
 from hybridve.hull.report.simulation_file import read_simulation
 from hybridve.hull.show_simulation import drawn_objects
 
@@ -350,3 +351,22 @@ def break_at(monkeypatch: pytest.MonkeyPatch, frame: int) -> None:
         return instants(*hulls, **keys)
 
     monkeypatch.setattr("hybridve.hull.simulate.instants", broken)
+
+
+def test_cameras_side_by_side_follow_what_moves_between_frames() -> None:
+    # Their axes are parallel, and meet nowhere: how large a pixel is, no geometry tells.
+    matrix = np.array([[200.0, 0, 80, 0], [0, 200, 60, 0], [0, 0, 1, 0]])
+    beside = matrix @ np.array([[1.0, 0, 0, -0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    views = make_views(("left", "right"), np.array([[160, 120]] * 2), np.array([matrix, beside]))
+    mask = np.zeros((120, 160), np.uint8)
+    mask[40:70, 30:60] = 1
+    before, after = (
+        make_hull(views, [np.roll(mask, shift_px, axis=1)] * 2) for shift_px in (0, 40)
+    )
+
+    way = instants(
+        before, after, start_s=0.0, elapsed_s=0.04, frame=1, step_s=0.002, mode="interpolate"
+    )
+
+    # 40 pixels of 15 mm, 3 m away: as often as once in 8 mm, and never more than 64 times.
+    assert len(list(way)) == 64

@@ -32,6 +32,10 @@ HullMode = Literal["interpolate", "hold"]
 #: so that nothing is on its other side between two steps.
 MOST_MOTION_M = 0.008
 
+#: What cameras look at is not nearer than the first; it is taken to be at the second where nothing
+#: tells.
+_LEAST_DEPTH_M, _USUAL_DEPTH_M = 0.05, 3.0
+
 #: Hulls between two frames at most: 0.5 m from one frame to the next are followed.
 MOST_HULLS = 64
 
@@ -161,8 +165,10 @@ def _pixels_m(views: Views) -> NDArray[np.float64]:
     """Return how long a pixel of each camera is in the middle of what they see, (C,) metres."""
     matrices = views.img_from_local
     focal_px = np.linalg.norm(np.cross(matrices[:, 0, :3], matrices[:, 2, :3]), axis=1)
-    depth_m: NDArray[np.float64] = np.abs(matrices[:, 2, 3]) / focal_px
-    return depth_m
+    depth_m = np.abs(matrices[:, 2, 3])
+    # Parallel axes meet nowhere: there the cameras themselves are the middle.
+    depth_m = np.where(depth_m > _LEAST_DEPTH_M, depth_m, _USUAL_DEPTH_M)
+    return np.asarray(depth_m / focal_px)
 
 
 def moves_at_most(before: NDArray[np.uint8], after: NDArray[np.uint8], most_px: int) -> bool:
