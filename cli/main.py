@@ -13,6 +13,7 @@ from hybridve.calib.errors import HybridveError
 from hybridve.cli.board import board
 from hybridve.cli.calibrate import calibrate
 from hybridve.cli.check import check
+from hybridve.cli.clashes import clashes
 from hybridve.cli.convert import convert
 from hybridve.cli.demo import demo
 from hybridve.cli.detect import detect
@@ -64,7 +65,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 for command in (
     *(demo, synth, init, board, check, calibrate, convert, segment, detect),
-    *(spacing, sweep, simulate, summary, render, doctor),
+    *(spacing, sweep, simulate, summary, clashes, render, doctor),
 ):
     cli.add_command(command)
 

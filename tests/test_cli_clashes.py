@@ -1,0 +1,164 @@
+"""``hybridve clashes`` as people use it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.clash_reports import Spot, write_clash_report
+
+Run = Callable[..., int]
+
+LEFT, RIGHT = (-0.04, 0.0, 0.5), (0.04, 0.0, 0.5)
+
+
+@pytest.fixture
+def report(tmp_path: Path) -> Path:
+    frames = [[Spot(LEFT, 0.03), Spot(RIGHT, -0.002)], [Spot(RIGHT, -0.003)], []]
+    return write_clash_report(tmp_path / "r.h5", frames, required_m=0.005)
+
+
+def told(run: Run, capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    capsys.readouterr()
+    run(*arguments, "--json")
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def error_of(
+    run: Run, capsys: pytest.CaptureFixture[str], *arguments: object, status: int = 1
+) -> str:
+    capsys.readouterr()
+    assert run(*arguments) == status
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    if status == 1:
+        assert len(shown.err.splitlines()) == 1
+    return shown.err
+
+
+def test_the_answer_comes_first_and_the_worst_on_top(
+    run: Run, report: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("clashes", report) == 0
+
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("2 clashes (2 new); look first at box-")
+    assert "reaches into box, 30.0 +-0.1 mm deep (frame 0, 0.00 s); sure" in lines[0]
+    assert "3 contacts of single frames gathered into 2 clashes" in lines[1]
+    assert lines[3].split()[1:4] == ["new", "clash", "box"]
+    assert lines[4].split()[1:5] == ["new", "too", "near", "box"]
+    assert f"ids and decisions: {report.with_suffix('.clashes.toml')}" in lines[-1]
+
+
+def test_what_was_decided_is_kept_shown_and_lets_a_script_pass(
+    run: Run, report: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = (one["id"] for one in told(run, capsys, "clashes", report)["clashes"])
+    assert run("clashes", report, "--fail-on-clash") == 3
+
+    why = ("--comment", "only the sleeve", "--who", "anna")
+    assert run("clashes", report, "--approve", first, *why, "--fail-on-clash") == 3
+    assert run("clashes", report, "--resolve", second, "--fail-on-clash") == 0
+
+    assert f"{first}: only the sleeve, anna" in capsys.readouterr().out
+    found = told(run, capsys, "clashes", report)
+    assert found["counts"] == {"approved": 1, "resolved": 1}
+    assert found["clashes"][0]["who"] == "anna"
+    assert run("clashes", report, "--reopen", first, "--fail-on-clash") == 3
+    (again, _) = told(run, capsys, "clashes", report)["clashes"]
+    assert (again["status"], again["comment"]) == ("active", "only the sleeve")
+
+
+def test_json_has_all_about_a_clash_in_metres(
+    run: Run, report: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = told(run, capsys, "clashes", report)["clashes"]
+
+    assert (first["kind"], second["kind"]) == ("clash", "too near")
+    assert first["worst"]["lower_m"] == pytest.approx(-0.0301)
+    assert first["worst"]["upper_m"] == pytest.approx(-0.03)
+    assert first["worst"]["on_object_m"] == pytest.approx(LEFT)
+    assert first["place_on_part_m"] == pytest.approx([-0.04, 0.0, 0.495])  # what is on the part
+    assert (second["first_frame"], second["last_frame"], second["frames"]) == (0, 1, 2)
+    assert second["worst"]["ends_at"] == []
+    assert first["sure"] is True
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (("--approve", "bax-2222"), 1, "there is no clash 'bax-2222'"),
+        (("--comment", "why"), 2, "--comment says why"),
+        (("--approve", "x", "--review", "x"), 2, "x is decided about twice"),
+    ],
+)
+def test_a_decision_that_cannot_be_is_one_line_and_nothing_is_written(
+    run: Run,
+    report: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    status: int,
+    message: str,
+) -> None:
+    assert message in error_of(run, capsys, "clashes", report, *arguments, status=status)
+    assert [path.name for path in report.parent.iterdir()] == ["r.h5"]
+
+
+def test_a_ledger_that_is_nonsense_is_never_written_over(
+    run: Run, report: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ledger = report.with_suffix(".clashes.toml")
+    ledger.write_text('status = "aproved', encoding="utf-8")
+
+    assert "not valid TOML" in error_of(run, capsys, "clashes", report)
+    assert "not valid TOML" in error_of(run, capsys, "clashes", report, "--approve", "x")
+    assert ledger.read_text(encoding="utf-8") == 'status = "aproved'
+
+
+def test_where_nothing_can_be_written_a_look_is_possible_and_a_decision_is_not(
+    run: Run, report: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ledger = tmp_path / "no" / "ledger.toml"
+
+    assert run("clashes", report, "--ledger", ledger) == 0
+    shown = capsys.readouterr()
+    assert "cannot be written" in shown.err
+    assert shown.out.startswith("2 clashes")
+    name = shown.out.splitlines()[3].split()[0]
+    call = ("clashes", report, "--ledger", ledger, "--approve", name)
+    assert "cannot be written" in error_of(run, capsys, *call)
+
+
+def test_what_no_longer_clashes_is_told_and_what_was_never_found_too(
+    run: Run, report: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, _ = (one["id"] for one in told(run, capsys, "clashes", report)["clashes"])
+    frames = [[Spot(RIGHT, -0.002)], [], []]
+    write_clash_report(report, frames, required_m=0.005, made="2026-02-01")
+
+    assert run("clashes", report) == 0
+    assert f"no longer found, so resolved: {first}" in capsys.readouterr().out
+
+    free = write_clash_report(report.parent / "free.h5", [[], []])
+    assert run("clashes", free, "--fail-on-clash") == 0
+    assert capsys.readouterr().out.startswith("no clashes: ")
+
+
+def test_rules_of_a_scene_replace_those_of_the_report(
+    run: Run, report: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "box.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", encoding="utf-8")
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        'format = "hybridve-scene"\nversion = 1\n[[object]]\nname = "box"\nmesh = "box.obj"\n'
+        'unit = "m"\n[[rule]]\nshortest_s = 0.15\ncomment = "brushes past"\n',
+        encoding="utf-8",
+    )
+
+    assert run("clashes", report, "--scene", scene) == 0
+
+    shown = capsys.readouterr().out
+    assert shown.startswith("1 clash (1 new)")
+    assert "rule 1 left out 1 clash in 1 frame: shorter than 0.15 s (brushes past)" in shown
