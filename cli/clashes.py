@@ -40,7 +40,7 @@ def _decision(status: str, name: str, what: str) -> Callable[[options.FC], optio
     "ledger_file",
     type=click.Path(path_type=Path),
     help="Where ids and decisions are kept; one file may serve several reports. Default: "
-    "REPORT.clashes.toml beside the report.",
+    "clashes.toml beside the report if it is there, else REPORT.clashes.toml.",
 )
 @click.option(
     "--scene",

@@ -1,4 +1,4 @@
-"""``hybridve clashes`` as people use it."""
+"""``hybridve clashes`` and ``hybridve diff`` as people use them."""
 
 import json
 from collections.abc import Callable
@@ -131,6 +131,20 @@ def test_where_nothing_can_be_written_a_look_is_possible_and_a_decision_is_not(
     assert "cannot be written" in error_of(run, capsys, *call)
 
 
+def test_reports_in_a_folder_share_its_ledger_if_there_is_one(
+    run: Run, report: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_clash_report(report.with_name("p2.h5"), [[Spot((-0.038, 0.001, 0.5), 0.03)]])
+    ledger = report.with_name("clashes.toml")
+    first, _ = told(run, capsys, "clashes", report, "--ledger", ledger)["clashes"]
+
+    (found,) = told(run, capsys, "clashes", other)["clashes"]
+
+    assert found["id"] == first["id"]
+    names = sorted(path.name for path in report.parent.iterdir())
+    assert names == ["clashes.toml", "p2.h5", "r.h5"]
+
+
 def test_what_no_longer_clashes_is_told_and_what_was_never_found_too(
     run: Run, report: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,3 +176,133 @@ def test_rules_of_a_scene_replace_those_of_the_report(
     shown = capsys.readouterr().out
     assert shown.startswith("1 clash (1 new)")
     assert "rule 1 left out 1 clash in 1 frame: shorter than 0.15 s (brushes past)" in shown
+
+
+def reports(folder: Path, old: list[Spot], new: list[Spot], seen: str = "two") -> list[Path]:
+    """Write two reports of one layout that requires 5 mm, of silhouettes of their own."""
+    return [
+        write_clash_report(folder / name, [spots] * 2, required_m=0.005, seen=which)
+        for name, spots, which in (("old.h5", old, "one"), ("new.h5", new, seen))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "status", "changes"),
+    [
+        ([Spot(LEFT, 0.03)], [Spot(LEFT, 0.0301)], 0, ["same"]),
+        ([Spot(LEFT, 0.03)], [Spot(LEFT, 0.033)], 6, ["worse"]),
+        ([Spot(LEFT, 0.03)], [Spot(LEFT, 0.027)], 0, ["better"]),
+        ([Spot(LEFT, 0.03)], [Spot(LEFT, 0.03), Spot(RIGHT, 0.01)], 6, ["appeared", "same"]),
+        ([Spot(LEFT, 0.03), Spot(RIGHT, -0.001)], [Spot(LEFT, 0.03)], 0, ["vanished", "same"]),
+        ([Spot(LEFT, 0.03), Spot(RIGHT, -0.0048)], [Spot(LEFT, 0.03)], 0, ["unclear", "same"]),
+        ([], [], 0, []),
+    ],
+)
+def test_a_change_is_what_is_beyond_what_both_reports_may_be_off(
+    run: Run,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    old: list[Spot],
+    new: list[Spot],
+    status: int,
+    changes: list[str],
+) -> None:
+    pair = reports(tmp_path, old, new)
+
+    assert run("diff", *pair) == status
+
+    text = capsys.readouterr().out
+    assert text.startswith("no change") == (set(changes) <= {"same", "unclear"})
+    found = told(run, capsys, "diff", *pair)
+    assert [one["change"] for one in found["comparisons"][0]["clashes"]] == changes
+    assert found["worse"] is (status == 6)
+    assert not (tmp_path / "new.clashes.toml").exists()
+
+
+def test_what_changed_most_is_told_first(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = [Spot(LEFT, 0.03), Spot(RIGHT, 0.01)]
+    pair = reports(tmp_path, both, [Spot(LEFT, 0.04), Spot(RIGHT, 0.01)])
+
+    assert run("diff", *pair) == 6
+
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("worse: 1 worse (1 clash the same); look first at box-")
+    assert first.endswith(
+        ": 30.0 +-0.1 deep (mm, frame 0) before, 40.0 +-0.1 deep (mm, frame 0) now"
+    )
+
+
+def test_of_the_same_silhouettes_a_tenth_of_a_millimetre_counts(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair = reports(tmp_path, [Spot(LEFT, 0.03)], [Spot(LEFT, 0.0303)], seen="one")
+
+    assert run("diff", *pair) == 6
+    assert "the same silhouettes, so that only bounds count" in capsys.readouterr().out
+
+
+def test_a_clash_that_broke_in_two_has_not_appeared(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = [Spot((0.0, 0.0, 0.5), 0.02, size_m=0.12)]
+    ends = [Spot((-0.05, 0.0, 0.5), 0.02), Spot((0.05, 0.0, 0.5), 0.01)]
+
+    for old, new in ((whole, ends), (ends, whole)):
+        pair = reports(tmp_path, old, new)
+        assert run("diff", *pair) == 0
+        assert capsys.readouterr().out.startswith("no change")
+
+
+def test_clashes_are_called_in_a_diff_what_the_ledger_calls_them(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new = reports(tmp_path, [Spot(LEFT, 0.03)], [Spot(LEFT, 0.03)])
+    (mine,) = told(run, capsys, "clashes", old)["clashes"]
+    ledger = old.with_suffix(".clashes.toml")
+    text = ledger.read_text(encoding="utf-8").replace(mine["id"], "the-sleeve")
+    ledger.write_text(text, encoding="utf-8")
+
+    (found,) = told(run, capsys, "diff", old, new)["comparisons"][0]["clashes"]
+
+    assert found["id"] == "the-sleeve"
+
+
+def test_of_one_recording_the_frames_are_compared_that_both_have(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    deeper = [[Spot(LEFT, 0.01 + 0.01 * frame)] for frame in range(4)]
+    every = write_clash_report(tmp_path / "every.h5", deeper)
+    other = write_clash_report(tmp_path / "other.h5", deeper[::2], step=2)
+
+    assert run("diff", every, other) == 0
+    assert "in the 2 frames that both have" in capsys.readouterr().out
+
+
+def test_folders_are_compared_report_by_report(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        write_clash_report(tmp_path / folder / "same.h5", [[Spot(LEFT)]])
+    write_clash_report(tmp_path / "a" / "alone.h5", [[]])
+
+    assert run("diff", tmp_path / "a", tmp_path / "b") == 0
+
+    text = capsys.readouterr().out
+    assert "no change (1 clash the same)" in text
+    assert f"{tmp_path / 'a' / 'alone.h5'}: the other folder has no such report" in text
+
+
+def test_what_cannot_be_compared_is_told_in_one_line(
+    run: Run, tmp_path: Path, report: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+
+    assert "is a folder" in error_of(run, capsys, "diff", tmp_path, report)
+    message = error_of(run, capsys, "diff", tmp_path, tmp_path / "empty")
+    assert "have no reports (*.h5) of the same name" in message
+    missing = tmp_path / "missing.h5"
+    assert f"{missing}: there is no such report" in error_of(run, capsys, "diff", report, missing)
+    assert list((tmp_path / "empty").iterdir()) == []

@@ -91,9 +91,9 @@ class Clash:
     worst : Worst
         Its worst frame.
     std_m : float
-        The standard deviation of its clearance, an estimate: the largest of its frames, as that of
-        a frame is 0 where the hull covers a point from which all surface is farther away. NaN if
-        unknown.
+        The standard deviation of its clearance, an estimate: that of its worst frame. Where that is
+        0, as the hull covers a point from which all surface is nearer than from those about it, the
+        median of its frames in which it is not. NaN if unknown.
     hinges_on : tuple of str
         Cameras without any one of which it would not be there, in all of its frames; none if it
         stands without any one in some frame.
@@ -453,7 +453,7 @@ def _clash(
     order = np.lexsort((contacts.row, -contacts.n_points, contacts.clearance_m[:, 1]))
     at = int(order[0])
     required_m = float(rows.about.get("required_clearance_m", 0.0))
-    std_m = float(np.fmax.reduce(_std_m(rows)[there]))
+    std_m = _std_of(_std_m(rows), int(contacts.row[at]), there)
     worst = _worst(report, rows, contacts, at, std_m)
     kind = KINDS[int(contacts.kind.min())]
     hinges_on, component = _hinges_on(rows, contacts), _component(rows, contacts)
@@ -478,6 +478,14 @@ def _clash(
         is_sure=not doubts,
         doubts=doubts,
     )
+
+
+def _std_of(std_m: NDArray[np.float64], worst: int, there: NDArray[np.int64]) -> float:
+    """Return the standard deviation of a clash, of those of its frames."""
+    if std_m[worst] != 0.0:
+        return float(std_m[worst])
+    above_m = std_m[there][std_m[there] > 0.0]
+    return float(np.median(above_m)) if len(above_m) else 0.0
 
 
 def _worst(

@@ -1,11 +1,12 @@
 """The ledger of clashes: what each is called, and what people have decided about it.
 
-A text file beside the report, ``REPORT.clashes.toml`` (or one for several reports), that is made to
-be edited and put under version control. It remembers every clash that was ever found: its id, where
-on its part it is, and its status. A clash of another run, of fewer frames, of outlines that err a
-little, of a layout that was moved, or of another session is the one that the ledger has nearest to
-that place on the part (`hybridve.hull.contact.gathering.matched`); only one that has none near gets
-a new id. A new id is short for the object and for a place on it, and never one that the ledger has.
+A text file beside the report, ``REPORT.clashes.toml`` (or ``clashes.toml`` for all in a folder, if
+that is there, or any other that is named), made to be edited and put under version control. It
+remembers every clash that was ever found: its id, where on its part it is, and its status. A clash
+of another run, of fewer frames, of outlines that err a little, of a layout that was moved, or of
+another session is the one that the ledger has nearest to that place on the part
+(`hybridve.hull.contact.gathering.matched`); only one that has none near gets a new id. A new id is
+short for the object and for a place on it, and never one that the ledger has.
 
 Status, as clash tools of the trade have it: *new* (first found in this run), *active* (found in an
 earlier run, too), *reviewed* and *approved* (as people say), *resolved* (found in an earlier run
@@ -35,6 +36,9 @@ from hybridve.hull.toml_io import Name, explain_validation, like, read_toml
 Status = Literal["new", "active", "reviewed", "approved", "resolved"]
 
 STATUSES: tuple[Status, ...] = get_args(Status)
+
+#: The ledger of all reports in a folder.
+OF_ALL = "clashes.toml"
 
 #: First ids are made of places to so many metres. Only first ones: afterwards the ledger knows.
 _CELL_M = 0.05
@@ -162,12 +166,15 @@ class Listed:
 def ledger_path(report: Path) -> Path:
     """Return where the ledger of a report is kept unless another is named.
 
+    It is that of the report, unless there is one of all reports in the folder, `OF_ALL`.
+
     Examples
     --------
     >>> ledger_path(Path("out/report.h5")).as_posix()
     'out/report.clashes.toml'
     """
-    return report.with_suffix(".clashes.toml")
+    of_all = report.with_name(OF_ALL)
+    return of_all if of_all.exists() else report.with_suffix(".clashes.toml")
 
 
 def read_ledger(path: Path) -> Ledger:
