@@ -158,13 +158,13 @@ def _join_places(boxes: Boxes, joined: "_Joined") -> None:
         np.concatenate([one.lower for one in around] or [np.zeros((0, 3))]),
         np.concatenate([one.upper for one in around] or [np.zeros((0, 3))]),
     )
+    thing = np.arange(len(tracks))
     for i, track in enumerate(tracks):
         near = whole[slice(i, i + 1)].gaps_m(whole[slice(i + 1, None)])[0] <= LINK_M
-        for j in (i + 1 + np.flatnonzero(near)).tolist():
-            if joined.root(int(track[0])) != joined.root(int(tracks[j][0])) and _meet(
-                boxes[track], boxes[tracks[j]]
-            ):
+        for j in (i + 1 + np.flatnonzero(near & (thing[i + 1 :] != thing[i]))).tolist():
+            if thing[j] != thing[i] and _meet(boxes[track], boxes[tracks[j]]):
                 joined.join(int(track[0]), int(tracks[j][0]))
+                thing[thing == thing[j]] = thing[i]
 
 
 #: Boxes that are compared with others at once.
