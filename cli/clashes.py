@@ -234,9 +234,10 @@ def _print(
     if gone:
         more = ", ..." if len(gone) > _MOST_NAMES else ""
         click.echo(f"  no longer found, so resolved: {', '.join(gone[:_MOST_NAMES])}{more}")
-    for verdict, count in found.frames_undecided.items():
+    if found.frames_undecided:
+        counts = ", ".join(f"{n} {verdict}" for verdict, n in found.frames_undecided.items())
         click.echo(
-            f"  besides, {options.counted(count, 'frame')} of objects {verdict!r}: see summary"
+            f"  not decided, frames of all objects together: {counts}; see `hybridve summary`"
         )
     click.echo(f"  ids and decisions: {ledger.path}")
 

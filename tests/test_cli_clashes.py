@@ -5,8 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from helpers.clash_reports import Spot, write_clash_report
+from helpers.sessions import write_ball_session, write_cube_scene
+
+from hybridve.hull.report.clashes import rules_of
+from hybridve.hull.report.read import read_report
 
 Run = Callable[..., int]
 
@@ -176,6 +182,43 @@ def test_rules_of_a_scene_replace_those_of_the_report(
     shown = capsys.readouterr().out
     assert shown.startswith("1 clash (1 new)")
     assert "rule 1 left out 1 clash in 1 frame: shorter than 0.15 s (brushes past)" in shown
+
+
+@pytest.mark.slow
+def test_a_clash_keeps_its_id_and_status_when_the_report_is_made_anew(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A ball of 20 cm radius goes through a cube, seen by cameras of 13 mm a pixel."""
+    centers = np.column_stack([np.linspace(-0.3, 0.3, 8), np.full(8, 0.15), np.zeros(8)])
+    session = write_ball_session(tmp_path / "session", centers)
+    larger = write_ball_session(tmp_path / "larger", centers)
+    for mask in larger.parent.glob("*/*.png"):
+        grown = cv2.dilate(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE), np.ones((3, 3)))
+        cv2.imwrite(str(mask), grown)
+    scene = write_cube_scene(tmp_path / "scene", {"cube": (0.0, 0.0, 0.0)})
+    moved = write_cube_scene(tmp_path / "moved", {"cube": (1.0, 1.0, 1.0)})
+    scene.write_text(scene.read_text() + "\n[[rule]]\nshortest_s = 0.02\n", encoding="utf-8")
+    report = tmp_path / "r.h5"
+
+    def detected(of: Path, layout: Path, *more: str) -> dict[str, Any]:
+        call = ("detect", of, "--scene", layout, "-o", report, "--viewport", 8, "--no-response")
+        assert run(*call, "--no-progress", "--overwrite", *more) == 0
+        (clash,) = told(run, capsys, "clashes", report)["clashes"]
+        return clash
+
+    first = detected(session, scene)
+    assert [rule.shortest_s for rule in rules_of(read_report(report))] == [0.02]
+    assert run("clashes", report, "--approve", first["id"], "--comment", "a ball") == 0
+    again = [
+        detected(session, scene, "--frames", "::2"),
+        detected(larger, scene),
+        detected(session, moved),
+    ]
+
+    for clash in again:
+        assert (clash["id"], clash["status"]) == (first["id"], "approved")
+        assert (clash["comment"], clash["ties"]) == ("a ball", [])
+    assert first["kind"] == "clash"
 
 
 def reports(folder: Path, old: list[Spot], new: list[Spot], seen: str = "two") -> list[Path]:

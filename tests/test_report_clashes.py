@@ -142,6 +142,30 @@ def test_where_the_part_stands_plays_no_role(tmp_path: Path) -> None:
         np.testing.assert_allclose(one.place.upper, other.place.upper, atol=1e-9)
 
 
+def test_a_hand_that_goes_along_with_a_part_that_moves_is_one_clash_in_one_place(
+    tmp_path: Path,
+) -> None:
+    poses = [np.column_stack([np.eye(3), [0.3 * frame, 0.0, 0.0]]) for frame in range(5)]
+    along = [[Spot(LEFT)]] * 5
+    # In the world this one stands still, and the part slides by beneath it.
+    beside = [[Spot((LEFT[0] - 0.3 * frame, 0.0, 0.5))] for frame in range(5)]
+
+    with_part = only(write_clash_report(tmp_path / "a.h5", along, poses=poses))
+    against = clashes_of(write_clash_report(tmp_path / "b.h5", beside, poses=poses)).clashes
+
+    np.testing.assert_allclose(with_part.around.center[0], [-0.04, 0.0, 0.495], atol=1e-9)
+    assert len(with_part.frames) == 5
+    assert len(against) > 1
+
+
+def test_what_only_comes_near_hinges_on_no_camera(tmp_path: Path) -> None:
+    weak = replace(SURE, survives=False, hinges_on=("cam2",))
+    frames = [[replace(Spot(LEFT, -0.002), doubt=weak)]]
+    path = write_clash_report(tmp_path / "r.h5", frames, required_m=0.005)
+
+    assert only(path).hinges_on == ()
+
+
 def test_rules_leave_out_and_what_they_leave_out_is_counted(tmp_path: Path) -> None:
     frames = [[Spot(LEFT), Spot(RIGHT)], [Spot(LEFT)], [Spot(LEFT)]]
     path = write_clash_report(tmp_path / "r.h5", frames)

@@ -95,8 +95,8 @@ class Clash:
         0, as the hull covers a point from which all surface is nearer than from those about it, the
         median of its frames in which it is not. NaN if unknown.
     hinges_on : tuple of str
-        Cameras without any one of which it would not be there, in all of its frames; none if it
-        stands without any one in some frame.
+        Cameras without any one of which it would not touch, in all frames in which it does; none if
+        it stands without any one in some frame, or only comes near.
     component : "real", "unsure" or ""
         Whether the volume of the hull that it is of holds something real: "unsure" if in no frame
         it is known to, so that it may be a phantom; "" where nobody asked.
@@ -518,9 +518,12 @@ def _worst(
 
 
 def _hinges_on(rows: ObjectColumns, contacts: _Contacts) -> tuple[str, ...]:
-    """Return the cameras without one of which it would be in no frame; none if it stands in one."""
+    """Return the cameras without one of which it would touch in no frame; none if in one it does.
+
+    What comes near is no farther away without a camera: the hull only grows.
+    """
     survives, hinges_on = rows.get("survives"), rows.get("hinges_on")
-    asked = contacts.row[contacts.is_worst]
+    asked = contacts.row[contacts.is_worst & (contacts.kind != KINDS.index("too near"))]
     if survives is None or hinges_on is None or not (survives[asked] == "no").all():
         return ()
     sets = [set(text.split(", ")) - {""} for text in hinges_on[asked].tolist()]

@@ -111,11 +111,14 @@ def write_clash_report(
     step: int = 1,
     agreement: SessionAgreement | None = None,
     settings: Mapping[str, Any] | None = None,
+    poses: Sequence[ArrayLike] = (),
 ) -> Path:
     """Write a report of one part, frame by frame with spots; None for a frame that is torn.
 
     Parameters
     ----------
+    poses : sequence of (3, 4)
+        Where a part that moves stood in each frame, instead of `world_from_mesh`.
     seen : str
         What the silhouettes were: two reports of one word saw the same.
     made : str
@@ -131,6 +134,9 @@ def write_clash_report(
         parts=frozenset({"clearance", "doubt"}),
         cameras=CAMERAS,
         meshes=(stored_box(world_from_mesh),),
+        placements=(
+            {first + step * row: np.asarray(pose) for row, pose in enumerate(poses)} or None,
+        ),
     )
     share = sum(seen.encode()) / 1e5
     camera = CameraFrame(share, 0, 1.0, 0.0, False, np.full(4, np.nan), Outline.empty())
@@ -138,7 +144,8 @@ def write_clash_report(
         for row, spots in enumerate(frames):
             index = first + step * row
             reason = "torn" if spots is None else ""
-            findings = () if spots is None else (_finding(spots, required_m, world_from_mesh),)
+            pose = poses[row] if poses else world_from_mesh
+            findings = () if spots is None else (_finding(spots, required_m, pose),)
             writer.append(
                 FrameResult(
                     index,
