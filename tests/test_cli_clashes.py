@@ -193,8 +193,9 @@ def test_a_clash_keeps_its_id_and_status_when_the_report_is_made_anew(
     session = write_ball_session(tmp_path / "session", centers)
     larger = write_ball_session(tmp_path / "larger", centers)
     for mask in larger.parent.glob("*/*.png"):
-        grown = cv2.dilate(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE), np.ones((3, 3)))
-        cv2.imwrite(str(mask), grown)
+        image = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(mask), cv2.dilate(image, np.ones((3, 3))))
     scene = write_cube_scene(tmp_path / "scene", {"cube": (0.0, 0.0, 0.0)})
     moved = write_cube_scene(tmp_path / "moved", {"cube": (1.0, 1.0, 1.0)})
     scene.write_text(scene.read_text() + "\n[[rule]]\nshortest_s = 0.02\n", encoding="utf-8")
@@ -203,6 +204,7 @@ def test_a_clash_keeps_its_id_and_status_when_the_report_is_made_anew(
     def detected(of: Path, layout: Path, *more: str) -> dict[str, Any]:
         call = ("detect", of, "--scene", layout, "-o", report, "--viewport", 8, "--no-response")
         assert run(*call, "--no-progress", "--overwrite", *more) == 0
+        clash: dict[str, Any]
         (clash,) = told(run, capsys, "clashes", report)["clashes"]
         return clash
 

@@ -111,7 +111,7 @@ def ids(asked: argparse.Namespace) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for participant in asked.participants:
-            task = DrawnTask("payload", asked.frames, participant=participant)
+            task = DrawnTask("payload", asked.frames, shrink=asked.shrink, participant=participant)
             session = task.write_session(folder / f"p{participant}")
             noisy = task.write_session(folder / f"p{participant} noisy", 1.0, seed=participant)
             for gap_mm in asked.gaps:
@@ -186,7 +186,9 @@ def diff(asked: argparse.Namespace) -> dict[str, float]:
     told = Told()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        task = DrawnTask("payload", asked.few_frames, participant=2, gap_mm=_DIFF_GAP_MM)
+        task = DrawnTask(
+            "payload", asked.few_frames, shrink=asked.shrink, participant=2, gap_mm=_DIFF_GAP_MM
+        )
         scene = task.write_scene(folder / "layout")
         lower = task.write_scene(
             folder / "layout", (0.0, 0.0, -_LOWER_MM), "lower.toml", only="payload_a"
@@ -234,11 +236,12 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     parser.add_argument("--every", type=int, default=10, help="a real change so many repeats")
     parser.add_argument("--participants", type=int, nargs="*", default=[1, 2, 3, 4])
     parser.add_argument("--gaps", type=float, nargs="*", default=list(GAPS_MM))
-    parser.add_argument("--smallest", action="store_true", help="once, a few frames")
+    parser.add_argument("--shrink", type=int, default=1, help="so many times fewer pixels each way")
+    parser.add_argument("--smallest", action="store_true", help="once, few frames, small pictures")
     asked = parser.parse_args(arguments)
     if asked.smallest:
-        asked.frames, asked.repeats, asked.participants, asked.gaps = 6, 1, [1], [110.0]
-        asked.few_frames = 4
+        asked.frames, asked.repeats, asked.participants, asked.gaps = 4, 1, [1], [110.0]
+        asked.few_frames, asked.every, asked.shrink = 2, 2, 4
     kinds = asked.kinds or ["ids", "diff"]
     told: dict[str, float] = {}
     if "ids" in kinds:

@@ -5,6 +5,7 @@ costs only its evaluation.
 """
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -22,20 +23,39 @@ from hybridve.hull.synth.presets import PRESETS
 class DrawnTask:
     """The task of a preset as one participant does it, in `n_frames` frames.
 
-    Attributes
+    Parameters
     ----------
-    fps : float
-        Frames a second.
+    preset : str
+        Which.
+    n_frames : int, optional
+        In how many frames the whole motion is seen; by default those of the preset.
+    shrink : int
+        Cameras have so many times fewer pixels each way.
+    **options : float
+        Of the preset.
     """
 
-    def __init__(self, preset: str, n_frames: int | None = None, **options: float) -> None:
+    def __init__(
+        self, preset: str, n_frames: int | None = None, *, shrink: int = 1, **options: float
+    ) -> None:
         chosen = PRESETS[preset]
         values = {one.name: one.default for one in chosen.options} | options
         self._stage = chosen.make_stage(**values)
         self._cameras = tuple(
-            replace(camera, model="PINHOLE", params=camera.params[:4])
+            replace(
+                camera,
+                model="PINHOLE",
+                width_px=camera.width_px // shrink,
+                height_px=camera.height_px // shrink,
+                params=camera.params[:4] / shrink,
+            )
             for camera in self._stage.cameras
         )
+        self.n_frames = chosen.n_frames if n_frames is None else n_frames
+        self.fps = chosen.fps * self.n_frames / chosen.n_frames
+
+    @cached_property
+    def _drawn(self) -> Drawn:
         lenses = [undistortion(camera) for camera in self._cameras]
         views = make_views(
             tuple(camera.name for camera in self._cameras),
@@ -47,10 +67,8 @@ class DrawnTask:
                 ]
             ),
         )
-        self.n_frames = chosen.n_frames if n_frames is None else n_frames
-        self.fps = chosen.fps * self.n_frames / chosen.n_frames
         same = self._cameras, self._cameras, views, lenses
-        self._drawn = Drawn(self._stage, *same, self.n_frames, self.fps, 0.0, 0.0)
+        return Drawn(self._stage, *same, self.n_frames, self.fps, 0.0, 0.0)
 
     def write_session(self, folder: Path, std_px: float = 0.0, seed: int = 0) -> Path:
         """Write the masks, whose outlines err by a normal error, another one in each frame."""
