@@ -360,14 +360,14 @@ def _places(listed: "tuple[Listed, ...]") -> list[tuple[str, ...]]:
         rows.append(
             (
                 one.entry.id,
-                _point(worst.on_object_world.tolist(), ".3f"),
-                _point(worst.on_hull_world.tolist(), ".3f"),
-                _point((1e3 * clash.place.center[0]).tolist(), ".0f"),
+                _point(worst.on_object_world.tolist(), 3),
+                _point(worst.on_hull_world.tolist(), 3),
+                _point((1e3 * clash.place.center[0]).tolist(), 0),
                 cameras,
             )
         )
     return rows
 
 
-def _point(values: list[float], form: str) -> str:
-    return f"({', '.join(f'{value + 0.0:{form}}' for value in values)})"
+def _point(values: list[float], digits: int) -> str:
+    return f"({', '.join(f'{round(value, digits) + 0.0:.{digits}f}' for value in values)})"

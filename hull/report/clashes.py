@@ -89,7 +89,7 @@ class Clash:
     around : Boxes
         The box that it never leaves.
     worst : Worst
-        Its worst frame.
+        Its worst frame; of several that bounds cannot tell apart, that with most collision points.
     std_m : float
         The standard deviation of its clearance, an estimate: that of its worst frame. Where that is
         0, as the hull covers a point from which all surface is nearer than from those about it, the
@@ -450,8 +450,7 @@ def _clash(
     there = np.unique(contacts.row)
     time_s = report.time_s[there]
     went = (np.diff(step[there]) > 2) & (np.diff(time_s) > _GAP_S)
-    order = np.lexsort((contacts.row, -contacts.n_points, contacts.clearance_m[:, 1]))
-    at = int(order[0])
+    at = _at_worst(contacts)
     required_m = float(rows.about.get("required_clearance_m", 0.0))
     std_m = _std_of(_std_m(rows), int(contacts.row[at]), there)
     worst = _worst(report, rows, contacts, at, std_m)
@@ -478,6 +477,15 @@ def _clash(
         is_sure=not doubts,
         doubts=doubts,
     )
+
+
+def _at_worst(contacts: _Contacts) -> int:
+    """Return which patch is the worst: of those that bounds cannot tell apart, the largest."""
+    lower_m, upper_m = contacts.clearance_m.T
+    first = int(upper_m.argmin())
+    alike = upper_m <= 2.0 * upper_m[first] - lower_m[first]
+    order = np.lexsort((contacts.row, upper_m, -contacts.n_points, ~alike))
+    return int(order[0])
 
 
 def _std_of(std_m: NDArray[np.float64], worst: int, there: NDArray[np.int64]) -> float:
