@@ -13,9 +13,11 @@ from hybridve.calib.errors import HybridveError
 from hybridve.cli.board import board
 from hybridve.cli.calibrate import calibrate
 from hybridve.cli.check import check
+from hybridve.cli.clashes import clashes
 from hybridve.cli.convert import convert
 from hybridve.cli.demo import demo
 from hybridve.cli.detect import detect
+from hybridve.cli.diff import diff
 from hybridve.cli.doctor import doctor
 from hybridve.cli.init import init
 from hybridve.cli.plan import plan
@@ -53,7 +55,8 @@ def cli(verbose: int, quiet: bool) -> None:
 
     Results go to stdout, progress to stderr. Exit status: 0 done (a collision found is a result),
     1 a problem you can fix, 2 wrong usage, 3 something clashes and --fail-on-clash was given,
-    4 a rig is worse than --max-error-mm or does not pass --check, 130 interrupted.
+    4 a rig is worse than --max-error-mm or does not pass --check, 6 diff found something worse,
+    130 interrupted.
     """
     level = (
         logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
@@ -65,7 +68,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 for command in (
     *(demo, synth, plan, init, board, check, calibrate, convert, segment, detect),
-    *(spacing, sweep, simulate, summary, render, doctor),
+    *(spacing, sweep, simulate, summary, clashes, diff, render, doctor),
 ):
     cli.add_command(command)
 

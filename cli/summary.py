@@ -1,15 +1,18 @@
 """``hybridve summary``: what a report found, as text, JSON or curves."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridve.calib.lengths import mm
+from hybridve.calib.lengths import at_least_mm, bounds_mm, mm
 from hybridve.cli import options
+from hybridve.cli.clashes import counted_clashes, sure_text, worst_text
 
 if TYPE_CHECKING:
+    from hybridve.hull.report.clashes import Clash
     from hybridve.hull.report.read import Report
 
 #: Beginnings of contact that are told of each object; the report and --json have all.
@@ -20,6 +23,9 @@ _MOST_WHY = 3
 
 #: Names in a list of objects, and numbers in one of frames.
 _MOST_NAMES = 8
+
+#: Names of objects in the first line.
+_MOST_FIRST = 3
 
 
 @click.command(short_help="Tell what a report found.")
@@ -74,12 +80,17 @@ def _refuse_picture(picture: Path, *, overwrite: bool) -> None:
 
 
 def print_summary(report: "Report") -> None:
-    """Print a report's summary: what was touched, what came near, how it began."""
+    """Print a report's summary: the answer in one line, then what it rests on."""
+    from hybridve.hull.report.clashes import gather_clashes
     from hybridve.hull.report.summarize import summarize
 
     numbers = summarize(report)
-    click.echo(_overall_text(numbers))
-    click.echo(f"{numbers['report']}: {numbers['frames']} frames, {numbers['seconds']:.2f} s")
+    clashes = gather_clashes(report, rules=()).clashes
+    click.echo(_overall_text(numbers, clashes))
+    about = f"{numbers['report']}: {numbers['frames']} frames, {numbers['seconds']:.2f} s"
+    if clashes:
+        about += f"; `hybridve clashes` tells of {counted_clashes(len(clashes))}"
+    click.echo(about)
     _print_causes(numbers["causes"])
     if numbers["frames_invalid"]:
         invalid = options.counted(numbers["frames_invalid"], "frame")
@@ -158,24 +169,87 @@ def _print_causes(causes: list[dict[str, Any]]) -> None:
         )
 
 
-def _overall_text(numbers: dict[str, Any]) -> str:
-    """Return the verdict on all objects in one line."""
+def _overall_text(numbers: dict[str, Any], clashes: "Sequence[Clash]") -> str:
+    """Return the answer in one line: who clashes, how surely, where to look."""
+    text = _verdict_text(numbers, clashes)
     if not numbers["trusted"]:
-        return f"not to be trusted: the cameras contradict each other ({_verdict_text(numbers)})"
-    return _verdict_text(numbers)
+        return f"not to be trusted: the cameras contradict each other ({text})"
+    return text
 
 
-def _verdict_text(numbers: dict[str, Any]) -> str:
-    every = len(numbers["objects"])
+#: What is said of objects by the worst verdict on them: of one, and of several.
+_SAID = {
+    "clash": ("is touched", "are touched"),
+    "inside": ("has something real wholly inside", "have something real wholly inside"),
+    "too near": ("has less room than it requires", "have less room than they require"),
+    "unknown": ("is not known about", "are not known about"),
+    "open": (
+        "may not keep its distance: nothing is proved",
+        "may not keep their distance: nothing is proved",
+    ),
+    "not seen": ("stands where the cameras cannot tell", "stand where the cameras cannot tell"),
+}
+
+
+def _verdict_text(numbers: dict[str, Any], clashes: "Sequence[Clash]") -> str:
+    verdict, every = numbers["verdict"], len(numbers["objects"])
     kept = numbers["objects_by_verdict"].get("kept", 0)
     is_any_kept = any("kept" in found["frames_by_verdict"] for found in numbers["objects"])
     rests_on = numbers["kept_rests_on"] if is_any_kept else ""
     rests = f"; what is kept rests on {rests_on}" if rests_on else ""
     if kept == every:
         whom = "the object keeps" if every == 1 else f"all {every} objects keep"
-        return f"kept: {whom} the distance{rests}"
-    found = ", ".join(f"{count} {one}" for one, count in numbers["objects_by_verdict"].items())
-    return f"{numbers['verdict']}: {kept} of {every} objects keep their distance ({found}){rests}"
+        return f"kept: {whom} the distance, which is proved{_at_95_text(numbers)}{rests}"
+    parts: list[str] = []
+    for one, count in numbers["objects_by_verdict"].items():
+        if one == "kept":
+            continue
+        of = f"{count} of {options.counted(every, 'object')}" if not parts else f"{count}"
+        text = f"{of} {_SAID[one][count > 1]}"
+        names = [found["name"] for found in numbers["objects"] if found["verdict"] == one]
+        worst = next((clash for clash in clashes if clash.name in names), None)
+        if worst is not None and one == worst.kind:
+            text += f", {_where_text(worst, names, clashes)}"
+        elif one == verdict:
+            text += f" ({_names_text(names)})"
+        parts.append(text)
+    if kept:
+        parts.append(f"{kept} {'keeps' if kept == 1 else 'keep'} the distance")
+    return f"{verdict}: {'; '.join(parts)}{rests}"
+
+
+def _where_text(worst: "Clash", names: list[str], clashes: "Sequence[Clash]") -> str:
+    """Return the worst clash in words, and which other objects are as bad."""
+    required = (
+        f" where {mm(worst.required_m, 'g')} are required" if worst.kind == "too near" else ""
+    )
+    ordered = dict.fromkeys(clash.name for clash in clashes if clash.name in names)
+    others = [name for name in ordered if name != worst.name]
+    then = f", then {_names_text(others)}" if others else ""
+    which = f"{worst.name} worst" if len(names) > 1 else worst.name
+    value = worst_text(worst).replace(" away", " mm away").replace(" deep", " mm deep")
+    return (
+        f"{which}: {value}{required} at {worst.worst.time_s:.2f} s (frame {worst.worst.frame}), "
+        f"{sure_text(worst)}{then}"
+    )
+
+
+def _names_text(names: list[str]) -> str:
+    more = len(names) - _MOST_FIRST
+    shown = ", ".join(names[:_MOST_FIRST])
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def _at_95_text(numbers: dict[str, Any]) -> str:
+    """Return which objects might not keep it if outlines are off, in words; else empty."""
+    weak = [
+        found["name"]
+        for found in numbers["objects"]
+        if found["clearance"] is not None
+        and found["clearance"]["at_least_95_m"] is not None
+        and found["required_clearance_m"] > found["clearance"]["at_least_95_m"]
+    ]
+    return f"; if outlines are off, {_names_text(weak)} might not (at 95 %)" if weak else ""
 
 
 def _frames_text(frames_by_verdict: dict[str, int]) -> str:
@@ -209,8 +283,8 @@ def _print_clearances(objects: list[dict[str, Any]]) -> None:
                 "-" if nearest is None else f"{nearest['time_s']:.2f} s",
                 "-"
                 if nearest is None or nearest["at_least_95_m"] is None
-                else f"at least {mm(nearest['at_least_95_m'])}",
-                mm(found["required_clearance_m"]) if found["required_clearance_m"] else "-",
+                else f"at least {at_least_mm(nearest['at_least_95_m'], nearest['lower_m'])}",
+                mm(found["required_clearance_m"], "g") if found["required_clearance_m"] else "-",
                 _below_text(found),
                 "-" if depth is None else _bounds_text(depth["lower_m"], depth["upper_m"]),
                 _recovery_text(recovery),
@@ -226,7 +300,7 @@ def _recovery_text(recovery: dict[str, Any] | None) -> str:
     no_exit = f"no exit in {options.counted(recovery['frames_no_exit'], 'frame')}"
     if recovery["d_rec_m"] is None:
         return no_exit
-    longest = mm(recovery["d_rec_m"])
+    longest = mm(recovery["d_rec_m"], ".1f")
     return f"{longest}, {no_exit}" if recovery["frames_no_exit"] else longest
 
 
@@ -271,7 +345,9 @@ def _warnings(found: dict[str, Any]) -> list[str]:
     recovery = found["recovery"]
     if recovery is not None and recovery["frames_asked_to_free"]:
         asked, shift_m = recovery["frames_asked_to_free"], recovery["free_shift_m"]
-        whole = f"{mm(shift_m)} mm along V_rec do in all" if shift_m is not None else "none does"
+        whole = (
+            f"{mm(shift_m, '.1f')} mm along V_rec do in all" if shift_m is not None else "none does"
+        )
         if recovery["frames_freed"] < asked:
             lines.append(
                 f"moving it by D_rec frees all of it in {recovery['frames_freed']} of "
@@ -295,8 +371,8 @@ def _speed_text(lower_m_s: float | None, upper_m_s: float | None) -> str:
 def _bounds_text(lower_m: float, upper_m: float | None) -> str:
     """Return bounds in millimetres; None above stands for no hull anywhere near."""
     if upper_m is None:
-        return f"beyond {mm(lower_m)}"
-    return mm(lower_m) if upper_m == lower_m else f"{mm(lower_m)}-{mm(upper_m)}"
+        return f"beyond {mm(lower_m, '.1f')}"
+    return bounds_mm(lower_m, upper_m)
 
 
 def _below_text(found: dict[str, Any]) -> str:

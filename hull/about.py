@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridve.calib.formats.rig_json import rig_to_dict
+from hybridve.calib.plain import to_plain
 from hybridve.calib.pose import Pose, compose
 from hybridve.hull.report.collisions import StoredMesh
 from hybridve.hull.report.schema import Part
@@ -44,6 +45,7 @@ def resolved_settings(chain: Chain) -> dict[str, Any]:
         "local_origin_m": list(local_origin_m(chain)),
         "query_origin_m": chain.views.origin_world.tolist(),
         **({"poses_sha256": dict(chain.tracks.sha256)} if chain.tracks else {}),
+        **({"rules": [to_plain(rule) for rule in chain.scene.rules]} if chain.scene.rules else {}),
     }
 
 

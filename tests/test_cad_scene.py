@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from hybridve.calib.errors import SceneError
 from hybridve.calib.pose import rotation_about_axes
+from hybridve.hull.cad.rules import Rule
 from hybridve.hull.cad.scene import load_scene, part_names
 
 TETRAHEDRON = "v 0 0 0\nv 1000 0 0\nv 0 1000 0\nv 0 0 1000\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -256,3 +257,54 @@ def test_the_checksum_of_a_mesh_by_itself_is_that_of_scene_and_mesh(folder: Path
     expected = hashlib.sha256(path.read_bytes() + (folder / "part.obj").read_bytes()).hexdigest()
 
     assert load_scene(path).checksum == expected
+
+
+RULE = "[[rule]]\n"
+
+
+def test_a_rule_requires_of_single_parts_what_it_says(folder: Path) -> None:
+    text = (
+        HEAD
+        + '[[object]]\nname = "pair"\nmesh = "two.obj"\nunit = "mm"\nrequired_clearance_mm = 9\n'
+        + RULE
+        + 'object = "pair.b"\nrequired_clearance_mm = 2\n'
+        + RULE
+        + 'ignore = true\nobject = ["pair.*"]\ncomment = "table"\n'
+        + "zone_mm = [[0, 0, 0], [1, 2, 3]]\n"
+        + RULE
+        + "shortest_s = 0.5\n"
+    )
+
+    scene = load_scene(scene_path(folder, text))
+
+    required_mm = {part.name: 1e3 * part.required_clearance_m for part in scene.objects}
+    assert required_mm == {"pair.a": 9.0, "pair.b": 2.0}
+    assert scene.rules == (
+        Rule(("pair.b",), required_clearance_m=0.002),
+        Rule(("pair.*",), True, ((0.0, 0.0, 0.0), (0.001, 0.002, 0.003)), comment="table"),
+        Rule(shortest_s=0.5),
+    )
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ("", "rule.1: has none of ignore, shortest_s, required_clearance_mm; a rule does one"),
+        ("ignore = true\nshortest_s = 1", "rule.1: has ignore and shortest_s of"),
+        ("ignore = false", "rule.1.ignore"),
+        ("shortest_s = 0", "rule.1.shortest_s"),
+        ("shortest = 1", "there is no such key; did you mean shortest_s?"),
+        ("shortest_s = 1\nzone_mm = [[0, 0, 0], [1, 1, 1]]", "rule.1.zone_mm: is of rules that"),
+        ("ignore = true\nzone_mm = [[0, 0, 0], [1, 0, 1]]", "rule.1.zone_mm: [[0.0, 0.0, 0.0], "),
+        ('ignore = true\nzone_in = "object"', "rule.1.zone_in: says of what frame zone_mm is"),
+        ('ignore = true\nobject = "prat"', "rule.1.object: no object is called 'prat'; did you"),
+        ('ignore = true\nobject = ["part", "x*"]', "rule.1.object: no object is called 'x*'"),
+        ("ignore = true\nobject = []", "rule.1.object"),
+    ],
+)
+def test_a_rule_that_cannot_be_is_refused_by_its_key(folder: Path, rule: str, message: str) -> None:
+    with pytest.raises(SceneError) as error:
+        load_scene(scene_path(folder, HEAD + OBJECT + RULE + rule + "\n"))
+
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)

@@ -247,11 +247,82 @@ def test_the_text_says_what_must_be_known(
     assert "hinges on a single camera: cam1, cam2" in told
     assert "may hold nothing real" in told
     assert "4, 1 more perhaps" in told
-    assert "30.00-30.10" in told
-    assert "12.30, no exit in 1 frame" in told
-    assert told.startswith("clash: 0 of 1 objects keep their distance (1 clash)")
+    assert "30.0 +-0.1" in told
+    assert "12.3, no exit in 1 frame" in told
+    assert "50.0 mm along V_rec do in all" in told
     assert "2 clash, 1 inside, 1 too near, 1 unknown, 1 open, 1 kept" in told
-    assert "moving it by D_rec frees all of it in 0 of 1 frame; 50.00 mm along V_rec do" in told
+    assert "moving it by D_rec frees all of it in 0 of 1 frame; 50.0 mm along V_rec do" in told
+
+
+def first_line(
+    run: Run, capsys: pytest.CaptureFixture[str], frames: list[Finding], path: Path, **asked: Any
+) -> str:
+    """Return what `summary` says first of a report of one object and these frames."""
+    only(frames, path, **asked)
+    capsys.readouterr()
+    assert run("summary", path) == 0
+    return capsys.readouterr().out.splitlines()[0]
+
+
+def touching(depth_mm: float, std_mm: float) -> Finding:
+    return deep(depth_mm, doubt=replace(DOUBT, std_m=std_mm / 1e3))
+
+
+@pytest.mark.parametrize(
+    ("frames", "required_m", "line"),
+    [
+        (
+            [near(20.0), touching(6.0, 1.0)],
+            0.0,
+            "clash: 1 of 1 object is touched, box: 6.1 +-0.1 mm deep at 0.10 s (frame 1), sure",
+        ),
+        (
+            [touching(6.0, 5.0), near(20.0)],
+            0.0,
+            "clash: 1 of 1 object is touched, box: 6.1 +-0.1 mm deep at 0.00 s (frame 0), not "
+            "sure: outlines may be off by as much",
+        ),
+        (
+            [deep(6.0, doubt=PHANTOM)],
+            0.0,
+            "clash: 1 of 1 object is touched, box: 6.1 +-0.1 mm deep at 0.00 s (frame 0), not "
+            "sure: may be a phantom, hinges on cam1 or cam2 alone",
+        ),
+        (
+            [near(7.0, 3.0)],
+            0.01,
+            "too near: 1 of 1 object has less room than it requires, box: 7.0 +-0.1 mm away "
+            "where 10 are required at 0.00 s (frame 0), not sure: outlines may be off by as much",
+        ),
+        (
+            [near(9.95, 5.0)],
+            0.01,
+            "open: 1 of 1 object may not keep its distance: nothing is proved (box)",
+        ),
+        (
+            [near(20.0, 15.0)],
+            0.01,
+            "kept: the object keeps the distance, which is proved",
+        ),
+        (
+            [near(20.0, 5.0)],
+            0.01,
+            "kept: the object keeps the distance, which is proved; if outlines are off, box might "
+            "not (at 95 %)",
+        ),
+    ],
+)
+def test_the_answer_comes_first_who_how_surely_and_where_to_look(
+    run: Run,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    frames: list[Finding],
+    required_m: float,
+    line: str,
+) -> None:
+    path = tmp_path / "r.h5"
+
+    assert first_line(run, capsys, frames, path, required_m=required_m) == line
 
 
 def test_the_picture_shows_each_object_in_its_colours(

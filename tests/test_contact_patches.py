@@ -3,71 +3,22 @@
 import numpy as np
 import pytest
 from helpers.contacts import FREE
-from helpers.hulls import ball_masks, look_at, projection, ring_views
+from helpers.plates import balls, found_in, looking_down, plate
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from hybridve.hull.cad.scene import SceneObject
 from hybridve.hull.contact.clearance import ClearanceMeter
-from hybridve.hull.contact.detect import Contact, detect_contacts, make_body
 from hybridve.hull.contact.patches import contact_patches
 from hybridve.hull.contact.recovery import recover
 from hybridve.hull.contact.respond import collision_point
-from hybridve.hull.query.reference import Reference, contains_points
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull, make_views
-from hybridve.hull.synth.meshes import box_mesh
+from hybridve.hull.query.reference import contains_points
 
 CENTERS = np.array([[-0.3, 0.0, 0.0], [0.3, 0.05, 0.0]])
 RADII_M = (0.06, 0.05)
 
 
-def looking_down(n_cameras: int = 6) -> Views:
-    """A ring of cameras and one above: two things beside each other leave no phantom."""
-    ring = ring_views(n_cameras)
-    above = projection(look_at(np.array([0.01, 0.0, 2.5]), np.zeros(3)), 700.0, 720, 720)
-    width, height = ring.sizes_px[0]
-    matrices = ring.img_from_local.copy()
-    matrices[:, :, 3] -= matrices[:, :, :3] @ ring.origin_world
-    return make_views(
-        (*ring.names, "above"),
-        np.array([*([(width, height)] * n_cameras), (720, 720)]),
-        np.array([*matrices, above]),
-    )
-
-
-def balls(views: Views, centers: NDArray[np.float64]) -> Hull:
-    masks = [
-        ball_masks(views, center, radius) for center, radius in zip(centers, RADII_M, strict=True)
-    ]
-    return make_hull(views, [np.maximum(*both) for both in zip(*masks, strict=True)])
-
-
-def plate(bottom_m: float) -> SceneObject:
-    """A plate of 1.2 x 0.4 x 0.02 m whose underside is at this height."""
-    mesh = box_mesh((1200.0, 400.0, 20.0), 40.0)
-    vertices = mesh.vertices_mm / 1000 + np.array([0.0, 0.0, bottom_m + 0.01])
-    return SceneObject(
-        "plate",
-        None,  # type: ignore[arg-type]
-        vertices,
-        mesh.faces.astype(np.int32),
-        0.0,
-        np.array([0.0, 0.0, bottom_m + 0.01]),
-        None,
-        True,
-    )
-
-
-def found_in(hull: Hull, part: SceneObject) -> tuple[ClearanceMeter, Contact]:
-    meter = ClearanceMeter(part.vertices_world, part.faces, is_closed=True)
-    with Reference() as engine:
-        (contact,) = detect_contacts(hull, [make_body(part, viewport=20)], engine)
-    return meter, contact
-
-
 def test_two_balls_that_touch_one_plate_are_two_patches() -> None:
-    hull, part = balls(looking_down(), CENTERS), plate(0.03)
+    hull, part = balls(looking_down(), RADII_M, CENTERS), plate(0.03)
     meter, contact = found_in(hull, part)
     reference = part.reference_point_world
 
@@ -94,7 +45,7 @@ def test_what_is_nearer_than_required_is_a_patch_with_bounds_of_its_own(
     required_m: float, count: int
 ) -> None:
     centers = CENTERS - [[0.0, 0.0, 0.0], [0.0, 0.0, 0.03]]
-    hull, part = balls(looking_down(), centers), plate(0.1)
+    hull, part = balls(looking_down(), RADII_M, centers), plate(0.1)
     meter, contact = found_in(hull, part)
 
     patches = contact_patches(
@@ -130,7 +81,7 @@ def test_what_is_nearer_than_required_is_a_patch_with_bounds_of_its_own(
 def test_patches_share_out_the_points_and_the_nearest_of_them_is_the_clearance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     centers = rng.uniform([-0.5, -0.2, -0.1], [0.5, 0.2, 0.1], (2, 3))
-    hull, part = balls(looking_down(3), centers), plate(0.1)
+    hull, part = balls(looking_down(3), RADII_M, centers), plate(0.1)
     meter, contact = found_in(hull, part)
     required_m = float(rng.choice([0.0, 0.03, 0.2]))
     whole = meter.measure(hull)
@@ -154,7 +105,7 @@ def test_patches_share_out_the_points_and_the_nearest_of_them_is_the_clearance(s
 
 
 def test_nothing_near_is_no_patch() -> None:
-    hull, part = balls(looking_down(), CENTERS - [0, 0, 0.5]), plate(0.1)
+    hull, part = balls(looking_down(), RADII_M, CENTERS - [0, 0, 0.5]), plate(0.1)
     meter = ClearanceMeter(part.vertices_world, part.faces, is_closed=True)
 
     assert (
@@ -167,7 +118,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def test_a_plate_is_free_once_it_is_moved_above_the_hull() -> None:
     """The way up that frees it is the height of the hull above its underside, which is measured."""
-    hull, part = balls(looking_down(), CENTERS), plate(0.03)
+    hull, part = balls(looking_down(), RADII_M, CENTERS), plate(0.03)
     meter = ClearanceMeter(part.vertices_world, part.faces, is_closed=True)
     above = meter.measure(hull, 0.5 * UP)
     needed_m = 0.5 - 0.5 * (above.lower_m + above.upper_m)  # to half a tolerance
@@ -188,9 +139,9 @@ def test_a_plate_is_free_once_it_is_moved_above_the_hull() -> None:
 def test_a_point_that_is_out_does_not_mean_that_the_object_is() -> None:
     """D_rec frees CP_obj; the other ball still holds the plate."""
     raised = CENTERS + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.02]])
-    hull, part = balls(looking_down(), raised), plate(0.03)
+    hull, part = balls(looking_down(), RADII_M, raised), plate(0.03)
     meter = ClearanceMeter(part.vertices_world, part.faces, is_closed=True)
-    first = balls(looking_down(), np.array([CENTERS[0], [0.0, 0.0, -0.9]]))
+    first = balls(looking_down(), RADII_M, np.array([CENTERS[0], [0.0, 0.0, -0.9]]))
     alone = recover(first, meter, UP, 0.01, 2.0)
 
     both = recover(hull, meter, UP, alone.free_m, 2.0)

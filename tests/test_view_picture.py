@@ -123,7 +123,7 @@ def test_what_a_lamp_does_not_reach_is_darker_triangle_by_triangle(scene: tuple[
 
     np.testing.assert_array_equal(plain, lit)
     # Colours are multiplied as they are encoded: 0.55 in the dark, and half-way 0.775.
-    is_face = is_blue_grey(lit)
+    is_face = is_blue_grey(lit.astype(np.uint8))
     assert is_face.mean() > MOST
     assert np.median(dark[is_face] / lit[is_face]) == pytest.approx(0.55, abs=0.02)
     assert np.median(half[is_face] / lit[is_face]) == pytest.approx(0.775, abs=0.02)

@@ -44,8 +44,9 @@ from hybridve.hull.cad.mesh import TESSELLATION_M, CadFile, kind_of, read_cad
 from hybridve.hull.cad.motion import Motion
 from hybridve.hull.cad.part import Part, Up
 from hybridve.hull.cad.readers import FORMATS, TESSELLATED, WITH_UNIT
+from hybridve.hull.cad.rules import Rule
 from hybridve.hull.cad.topology import Topology, meeting_faces
-from hybridve.hull.toml_io import Name, expand_root, explain_validation, read_toml
+from hybridve.hull.toml_io import Name, expand_root, explain_validation, like, read_toml
 
 _log = logging.getLogger(__name__)
 
@@ -144,12 +145,65 @@ class _EffectTable(BaseModel):
     kind: str
 
 
+#: The keys of what a rule does.
+_ACTIONS = ("ignore", "shortest_s", "required_clearance_mm")
+
+
+class _RuleTable(_Table):
+    object: str | Annotated[list[str], Field(min_length=1)] = "*"
+    ignore: Literal[True] | None = None
+    zone_mm: tuple[_Vector, _Vector] | None = None
+    zone_in: Literal["world", "object"] | None = None
+    shortest_s: Annotated[float, Field(gt=0)] | None = None
+    required_clearance_mm: Annotated[float, Field(ge=0)] | None = None
+    comment: str = ""
+
+    @field_validator("zone_mm")
+    @classmethod
+    def _has_room(cls, zone: tuple[_Vector, _Vector] | None) -> tuple[_Vector, _Vector] | None:
+        if zone is not None and not all(a < b for a, b in zip(*zone, strict=True)):
+            raise ValueError(
+                f"{list(map(list, zone))} holds nothing; give its lower corner and its upper one"
+            )
+        return zone
+
+    @model_validator(mode="after")
+    def _does_one_thing(self) -> "_RuleTable":
+        given = [key for key in _ACTIONS if getattr(self, key) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"has {found} of {', '.join(_ACTIONS)}; a rule does one thing")
+        if self.zone_mm is not None and not self.ignore:
+            raise ValueError(f"zone_mm: is of rules that ignore; {given[0]} holds everywhere")
+        if self.zone_in is not None and self.zone_mm is None:
+            raise ValueError("zone_in: says of what frame zone_mm is, which is missing")
+        return self
+
+    def rule(self) -> Rule:
+        """Return it in metres."""
+        zone_m = None
+        if self.zone_mm is not None:
+            (a, b, c), (d, e, f) = self.zone_mm
+            zone_m = (a / 1e3, b / 1e3, c / 1e3), (d / 1e3, e / 1e3, f / 1e3)
+        required_mm = self.required_clearance_mm
+        return Rule(
+            (self.object,) if isinstance(self.object, str) else tuple(self.object),
+            bool(self.ignore),
+            zone_m,
+            self.zone_in or "world",
+            self.shortest_s or 0.0,
+            None if required_mm is None else required_mm / 1e3,
+            self.comment,
+        )
+
+
 class _SceneTable(_Table):
     format: Literal["hybridve-scene"]
     version: Literal[1]
     root: str = "."
     object: Annotated[list[ObjectTable], Field(min_length=1)]
     effect: list[_EffectTable] = []
+    rule: list[_RuleTable] = []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,12 +310,15 @@ class Scene:
     checksum : str
         SHA-256 over the scene.toml, the meshes it names, the files that these lean on, and the
         files that tell where objects move.
+    rules : tuple of Rule
+        What the list of clashes leaves out, and what single objects require; `objects` have it.
     """
 
     path: Path
     objects: tuple[SceneObject, ...]
     effects: tuple[dict[str, Any], ...]
     checksum: str
+    rules: tuple[Rule, ...] = ()
 
     @property
     def moves(self) -> bool:
@@ -359,11 +416,13 @@ def load_scene(path: Path) -> Scene:
             checksum.update(file.read_bytes())
         if (told_by := _motion_file(entry)) is not None:
             checksum.update((root / told_by[1]).read_bytes())
+    rules = tuple(entry.rule() for entry in parsed.rule)
     return Scene(
         path=path,
-        objects=tuple(objects.values()),
+        objects=_required_by(rules, objects, path),
         effects=tuple(entry.model_dump() for entry in parsed.effect),
         checksum=checksum.hexdigest(),
+        rules=rules,
     )
 
 
@@ -380,6 +439,25 @@ def _tell_coarse(entry: ObjectTable, cad: CadFile, label: str) -> None:
         "with translate_mm, or in double precision",
         *(label, entry.name, cad.path, f"{farthest_m:,.0f}", 1000.0 * worst.rounding * unit_m),
     )
+
+
+def _required_by(
+    rules: tuple[Rule, ...], objects: dict[str, SceneObject], path: Path
+) -> tuple[SceneObject, ...]:
+    """Return the objects with the clearance that rules require of them, the last of those."""
+    for number, rule in enumerate(rules, start=1):
+        for pattern in rule.objects:
+            if not any(Rule((pattern,)).holds_for(name) for name in objects):
+                raise SceneError(
+                    f"{path}: rule.{number}.object: no object is called {pattern!r}"
+                    f"{like(pattern, list(objects))}"
+                )
+        if rule.required_clearance_m is not None:
+            for name in filter(rule.holds_for, list(objects)):
+                objects[name] = replace(
+                    objects[name], required_clearance_m=rule.required_clearance_m
+                )
+    return tuple(objects.values())
 
 
 def _refuse_missing_units(table: dict[str, Any], path: Path) -> None:

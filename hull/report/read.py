@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import ReportError
 from hybridve.calib.plain import read_strictly, to_plain
 from hybridve.hull.agreement.record import SessionAgreement
+from hybridve.hull.contact.gathering import Boxes
 from hybridve.hull.contact.verdict import Facts, judge
 from hybridve.hull.report.collisions import Runs, StoredMesh
 from hybridve.hull.report.columns import (
@@ -329,6 +330,53 @@ def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float64], N
         runs = Runs(*(group[column.name][start:stop] for column in RUN_COLUMNS))
         xyz_m, triangle = read_mesh(group).points(runs, row)
         return xyz_m + _origin(file), triangle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Standing:
+    """Where an object stood.
+
+    Attributes
+    ----------
+    world_from_part : (1 or F, 3, 4) float64
+        From the frame of its mesh to the world, metres; of one that moves a row a frame, NaN where
+        that is not known.
+    box : Boxes or None
+        The box around its mesh, in the frame of the mesh; None in a report of version 1, which
+        holds no mesh.
+    """
+
+    world_from_part: NDArray[np.float64]
+    box: Boxes | None
+
+    def world_from_part_at(self, row: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return it in some rows of the report, (N, 3, 4)."""
+        moves = len(self.world_from_part) > 1
+        return self.world_from_part[row if moves else np.zeros(len(row), np.int64)]
+
+
+def read_standing(path: Path) -> dict[str, Standing]:
+    """Return where the objects of a report stood, by name.
+
+    Raises
+    ------
+    ReportError
+        As `read_report`.
+    """
+    with reading(path, "report", *READ_VERSIONS) as file:
+        origin_m = _origin(file)
+        return {
+            name: _standing(group, origin_m) for name, group in file["hybridve/objects"].items()
+        }
+
+
+def _standing(group: h5py.Group, origin_m: NDArray[np.float64]) -> Standing:
+    if "mesh/placement" not in group:
+        return Standing(np.eye(3, 4)[None], None)
+    world_from_part = group["mesh/placement"][:]
+    world_from_part[:, :, 3] += origin_m
+    used_m = group["mesh/vertices_m"][:][group["mesh/faces"][:].ravel()]
+    return Standing(world_from_part, Boxes(used_m, used_m).around())
 
 
 def read_mesh(group: h5py.Group) -> StoredMesh:
