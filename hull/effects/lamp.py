@@ -213,6 +213,8 @@ def _open_range(
 
 @compiled
 def _reach_past_cad(
+    first: int,
+    stop: int,
     samples: NDArray[np.float64],
     normals: NDArray[np.float64],
     is_two_sided: NDArray[np.bool_],
@@ -220,17 +222,16 @@ def _reach_past_cad(
     direction: NDArray[np.float64],
     cone_cosine: float,
     tree: SurfaceTree,
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Return which samples (T, S, 3) which lamps (L, 3) reach: (T, S, L), and their gain there.
+    reached: NDArray[np.bool_],
+    gain: NDArray[np.float32],
+) -> None:
+    """Write which samples (T, S, 3) which lamps (L, 3) reach: (T, S, L), and their gain there.
 
-    Samples that lie on CAD, whose triangles have unit normals (T, 3).
+    Of triangles `first` to `stop`. Samples lie on CAD, whose triangles have unit normals (T, 3).
     """
-    n_triangles, n_each = samples.shape[:2]
-    reached = np.zeros((n_triangles, n_each, len(lamps)), np.bool_)
-    gain = np.zeros((n_triangles, n_each, len(lamps)), np.float32)
     waiting, way = np.zeros(WAITING, np.int64), np.zeros(3)
-    for triangle in range(n_triangles):
-        for sample in range(n_each):
+    for triangle in range(first, stop):
+        for sample in range(samples.shape[1]):
             for lamp in range(len(lamps)):
                 squared, along, facing = 0.0, 0.0, 0.0
                 for axis in range(3):
@@ -248,7 +249,6 @@ def _reach_past_cad(
                 if found < 0:
                     reached[triangle, sample, lamp] = True
                     gain[triangle, sample, lamp] = facing / (squared * length_m)
-    return reached, gain
 
 
 @compiled
@@ -420,14 +420,29 @@ class Lamp:
             np.tile(np.arange(count, dtype=np.uint32), n_triangles),
         ).reshape(n_triangles, count, 3)
         shading = [vertices_of(one, self._placed)[one.faces] - origin_world for one in self._scene]
-        self._reached, self._gain = _reach_past_cad(
-            self._samples,
-            normals,
-            is_two_sided,
-            self._lamps,
-            self._direction,
-            self._cosine,
-            tree_of(np.concatenate(shading)),
+        shape = (n_triangles, count, len(self._lamps))
+        self._reached, self._gain = np.zeros(shape, np.bool_), np.zeros(shape, np.float32)
+        tree = tree_of(np.concatenate(shading))
+        self._threads.run(
+            [
+                (
+                    _reach_past_cad,
+                    (
+                        first,
+                        stop,
+                        self._samples,
+                        normals,
+                        is_two_sided,
+                        self._lamps,
+                        self._direction,
+                        self._cosine,
+                        tree,
+                        self._reached,
+                        self._gain,
+                    ),
+                )
+                for first, stop in self._shares()
+            ]
         )
         lit = self._reached.mean(axis=2)[:, self._small].mean(axis=(1, 2))
         self.share_without = np.asarray(lit, np.float64)
@@ -437,10 +452,7 @@ class Lamp:
         views = hull.views
         lamp_world = self._lamps[:1] + views.origin_world
         least_m = float(least_stretches(views, lamp_world)[0])
-        count = len(self._corners)
-        told = np.zeros((count, 3))
-        n_shares = min(self._threads.n_shares, max(count // _MANY, 1))
-        ends = np.linspace(0, count, n_shares + 1).astype(np.int64)
+        told = np.zeros((len(self._corners), 3))
         self._threads.run(
             [
                 (
@@ -459,10 +471,17 @@ class Lamp:
                         told,
                     ),
                 )
-                for first, stop in itertools.pairwise(ends)
+                for first, stop in self._shares()
             ]
         )
         return Lit(told[:, 0], told[:, 1], told[:, 2])
+
+    def _shares(self) -> list[tuple[int, int]]:
+        """Return from which triangle to which each call of a thread goes."""
+        count = len(self._corners)
+        n_shares = min(self._threads.n_shares, max(count // _MANY, 1))
+        ends = np.linspace(0, count, n_shares + 1).astype(np.int64)
+        return list(itertools.pairwise(ends))
 
     def by_object(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the area of each object, (K,) m^2, that shares (T,) of its triangles make up."""
