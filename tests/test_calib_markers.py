@@ -253,3 +253,24 @@ def test_a_real_charuco_is_found_in_part(recordings: Path, name: str, least: int
     assert detection.corners is not None, detection.how
     assert np.isfinite(detection.corners[:, 0]).sum() >= least  # OpenCV alone finds 86 in the first
     assert "new pattern" in detection.how
+
+
+@pytest.mark.parametrize(("side_px", "marker_share"), [(60, 0.75), (50, 0.7), (70, 0.5)])
+def test_corners_are_where_squares_meet_though_markers_are_printed_off(
+    side_px: int, marker_share: float
+) -> None:
+    board = Charuco(8, 6, 0.08, 0.08 * marker_share, "DICT_4X4_250")
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    printed = cv2.aruco.CharucoBoard((8, 6), 0.08, 0.08 * marker_share, dictionary)
+    # OpenCV rounds where a marker begins: towards the middle of the board, half a pixel at most.
+    sheet = printed.generateImage((8 * side_px, 6 * side_px))
+    picture = cv2.GaussianBlur(
+        cv2.copyMakeBorder(sheet, *[100] * 4, cv2.BORDER_CONSTANT, value=90), (0, 0), 0.7
+    )
+
+    corners = board.detect(picture).corners
+
+    assert corners is not None
+    x, y = np.meshgrid(np.arange(1, 8), np.arange(5, 0, -1))
+    expected = 100.0 + side_px * np.column_stack([x.ravel(), y.ravel()])
+    np.testing.assert_allclose(corners, expected, atol=0.01)

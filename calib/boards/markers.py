@@ -39,6 +39,12 @@ DICTIONARIES = tuple(
 )
 
 
+#: Of a ChArUco board only what is farther than this from a marker says where a corner is, in
+#: squares: markers are printed off by half a pixel of the printed picture here and there, and blur
+#: brings that nearer. What is on the lines between squares says it always.
+_MARKER_BLUR, _ON_THE_LINE = 0.08, 0.02
+
+
 @dataclass(frozen=True, slots=True)
 class Charuco:
     """A chessboard with a marker in each white square; its points are the inner corners.
@@ -299,6 +305,13 @@ def _charuco_pattern(board: Charuco, legacy: bool) -> Pattern:
         sign[in_white & (depth >= ring)] = 0.0
         return np.where(((square >= 0) & (square < (columns, rows))).all(axis=1), sign, 0.0)
 
+    def steady_at(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+        lower = np.floor(places)
+        square = np.column_stack([lower[:, 0] + 1, rows - 2 - lower[:, 1]])
+        depth = np.minimum(places - lower, 1.0 - (places - lower)).min(axis=1)
+        in_black = square.sum(axis=1) % 2 != white
+        return np.asarray(in_black | (depth < max(margin - _MARKER_BLUR, _ON_THE_LINE)))
+
     squares = _grid(columns, rows + 2 * _ROWS_BEYOND) - (0, _ROWS_BEYOND)
     squares = squares[squares.sum(axis=1) % 2 == white]
     on_board = (squares[:, 1] >= 0) & (squares[:, 1] < rows)
@@ -315,6 +328,7 @@ def _charuco_pattern(board: Charuco, legacy: bool) -> Pattern:
         quads=quads[on_board],
         reach=3.0,
         signs=around(points, sign_at),
+        steady=around(points, steady_at),
         border_bits=1,
         ids_beyond=ids[beyond],
         quads_beyond=quads[beyond],

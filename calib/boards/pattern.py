@@ -70,6 +70,9 @@ class Pattern:
         more: where they are seen, the board is larger, or counted from another number.
     doubt : str
         What may be the matter where markers are read and no points are found at them.
+    steady : (N, 2 K) bool, optional
+        Which of these places are printed as the point is: those in markers are not, which may be
+        off from it by the rounding of a printed picture. None: all.
     """
 
     label: str
@@ -82,6 +85,7 @@ class Pattern:
     ids_beyond: NDArray[np.intp]
     quads_beyond: NDArray[np.float64]
     doubt: str = ""
+    steady: NDArray[np.bool_] | None = None
 
 
 def around(
@@ -337,7 +341,10 @@ def _refine(
     inside = ((reached > 0) & (reached < grey.shape[::-1])).all(axis=-1)
     signs = np.where(inside, signs, 0.0)
     ahead, behind = np.split(signs, 2, axis=1)
-    weights = ((ahead != 0) & (behind != 0)).astype(np.float64)
+    counts = (ahead != 0) & (behind != 0)
+    if pattern.steady is not None:
+        counts &= np.logical_and(*np.split(pattern.steady[wanted], 2, axis=1))
+    weights = counts.astype(np.float64)
 
     moved = middles
     for blur in (0.15, 0.0):
