@@ -264,9 +264,7 @@ def test_corners_are_where_squares_meet_though_markers_are_printed_off(
     printed = cv2.aruco.CharucoBoard((8, 6), 0.08, 0.08 * marker_share, dictionary)
     # OpenCV rounds where a marker begins: towards the middle of the board, half a pixel at most.
     sheet = printed.generateImage((8 * side_px, 6 * side_px))
-    picture = cv2.GaussianBlur(
-        cv2.copyMakeBorder(sheet, *[100] * 4, cv2.BORDER_CONSTANT, value=90), (0, 0), 0.7
-    )
+    picture = cv2.GaussianBlur(np.pad(sheet, 100, constant_values=90), (0, 0), 0.7)
 
     corners = board.detect(picture).corners
 

@@ -305,12 +305,13 @@ def _charuco_pattern(board: Charuco, legacy: bool) -> Pattern:
         sign[in_white & (depth >= ring)] = 0.0
         return np.where(((square >= 0) & (square < (columns, rows))).all(axis=1), sign, 0.0)
 
-    def steady_at(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def steady_at(places: NDArray[np.float64]) -> NDArray[np.float64]:
         lower = np.floor(places)
         square = np.column_stack([lower[:, 0] + 1, rows - 2 - lower[:, 1]])
         depth = np.minimum(places - lower, 1.0 - (places - lower)).min(axis=1)
         in_black = square.sum(axis=1) % 2 != white
-        return np.asarray(in_black | (depth < max(margin - _MARKER_BLUR, _ON_THE_LINE)))
+        steady = in_black | (depth < max(margin - _MARKER_BLUR, _ON_THE_LINE))
+        return np.asarray(steady, np.float64)
 
     squares = _grid(columns, rows + 2 * _ROWS_BEYOND) - (0, _ROWS_BEYOND)
     squares = squares[squares.sum(axis=1) % 2 == white]
@@ -328,7 +329,7 @@ def _charuco_pattern(board: Charuco, legacy: bool) -> Pattern:
         quads=quads[on_board],
         reach=3.0,
         signs=around(points, sign_at),
-        steady=around(points, steady_at),
+        steady=around(points, steady_at) > 0,
         border_bits=1,
         ids_beyond=ids[beyond],
         quads_beyond=quads[beyond],
