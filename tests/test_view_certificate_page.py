@@ -154,6 +154,8 @@ def test_the_page_says_what_the_certificate_says(
 
     assert certificate.verdict in page.text
     assert "hall 7" in page.text
+    assert "Not in these errors" in page.text
+    assert "the choice of a lens model" in page.words
     for error_m in (
         certificate.error95_m,
         certificate.median_error95_m,
