@@ -155,7 +155,7 @@ def test_the_page_says_what_the_certificate_says(
     assert certificate.verdict in page.text
     assert "hall 7" in page.text
     assert "Not in these errors" in page.text
-    assert "the choice of a lens model" in page.words
+    assert "the choice of a lens model" in page.text
     for error_m in (
         certificate.error95_m,
         certificate.median_error95_m,
