@@ -74,7 +74,7 @@ def doctor(prepare: bool, as_json: bool) -> None:
     All that the commands load is tried, each in a process that it may end, and what fails is told
     with what installs it.
 
-    With --prepare, the loops of the query are compiled, if they are not yet: some ten seconds that
+    With --prepare, the loops of the query are compiled, if they are not yet: a minute or two that
     the first detect need not wait. They are kept in ~/.cache/hybridve, or where HYBRIDVE_CACHE
     says.
 

@@ -1,16 +1,13 @@
 """Compiles all that commands need, before it is needed: at set-up, or by ``doctor --prepare``.
 
 The code is run on the tiniest input, and what was compiled is kept where every later start looks
-(see `hybridve.hull.jit`). numba compiles in one thread at a time; what effects alone need is
-compiled by a process beside, as it shares little with the rest.
+(see `hybridve.hull.jit`). numba compiles in one thread at a time. Two processes side by side were
+tried: two that compile one function for different types at once would take each other's code.
 """
 
 import gc
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -68,29 +65,14 @@ def prepare_kernels() -> bool:
         collects = gc.isenabled()
         gc.disable()
         try:
-            with _effects_beside():
-                _run_kernels()
+            _run_kernels()
+            _run_effects()
         finally:
             if collects:
                 gc.enable()
         held = sorted(str(path.relative_to(kept)) for path in kept.rglob("*.nbc"))
         (kept / _SIGN).write_text("\n".join(held) + "\n", encoding="utf-8")
     return is_prepared()
-
-
-@contextmanager
-def _effects_beside() -> Iterator[None]:
-    """Compile what effects need in a process of its own, which is done when the block is left."""
-    beside = get_context("spawn").Process(target=_run_effects)
-    beside.start()
-    try:
-        yield
-        beside.join()
-    finally:
-        beside.kill()
-        beside.join()
-    if beside.exitcode:
-        raise RuntimeError(f"what effects need was not compiled (status {beside.exitcode})")
 
 
 def _run_kernels() -> None:

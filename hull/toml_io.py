@@ -28,10 +28,27 @@ def _is_name(name: str) -> str:
 Name = Annotated[str, AfterValidator(_is_name)]
 
 
+#: Where each kind of file comes from, for a person who has none.
+_BEGUN_BY = {
+    "session": "hybridve init",
+    "scene": "hybridve init",
+    "plan": "hybridve plan --example",
+}
+
+
 def read_toml(
-    path: Path, what: str, error_class: type[HybridveError]
+    path: Path, kind: str, error_class: type[HybridveError]
 ) -> tuple[dict[str, Any], bytes]:
     """Return a TOML file's table and its bytes.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : str
+        What its key ``format`` says behind "hybridve-", if it says anything.
+    error_class : type
+        Of the errors.
 
     Raises
     ------
@@ -41,10 +58,8 @@ def read_toml(
     try:
         text = path.read_bytes()
     except FileNotFoundError:
-        raise error_class(
-            f"{path}: there is no such {what}; name a {what}.toml, or begin one with "
-            "`hybridve init`"
-        ) from None
+        begin = f", or begin one with `{_BEGUN_BY[kind]}`" if kind in _BEGUN_BY else ""
+        raise error_class(f"{path}: there is no such {kind}; name a {kind}.toml{begin}") from None
     except OSError as error:
         raise error_class(f"{path}: cannot be read: {error.strerror}") from error
     try:
@@ -59,10 +74,10 @@ def read_toml(
             hint = "; write folders with /, or the path in 'single quotes'"
         raise error_class(f"{path}: not valid TOML: {error}{hint}") from error
     found = table.get("format")
-    if isinstance(found, str) and found.startswith("hybridve-") and found != f"hybridve-{what}":
+    if isinstance(found, str) and found.startswith("hybridve-") and found != f"hybridve-{kind}":
         raise error_class(
             f"{path}: is a {found.removeprefix('hybridve-')} (format = {found!r}), expected a "
-            f"{what}; were two files exchanged?"
+            f"{kind}; were two files exchanged?"
         )
     return table, text
 

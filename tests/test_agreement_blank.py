@@ -141,7 +141,9 @@ def test_what_is_kept_says_that_it_rests_on_a_camera_that_saw_nothing(
     asked = ("detect", session, "--scene", scene, "-o", report, "--fail-on-doubt")
     assert run(*asked, "--fail-on-clash") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == f"kept: the object keeps the distance; what is kept rests on {rests_on}"
+    assert lines[0] == (
+        f"kept: the object keeps the distance, which is proved; what is kept rests on {rests_on}"
+    )
     assert sum(line.strip().startswith(asks) for line in lines) == 1
     assert run("summary", report, "--json") == 0
     found = json.loads(capsys.readouterr().out)

@@ -386,4 +386,4 @@ def test_a_second_detect_does_without_the_readers(folder: Path, tmp_path: Path) 
     ]
 
     assert shown[0][2:-1] == shown[1][2:-1]
-    assert "1 clash" in shown[0][0]
+    assert "1 of 1 object is touched" in shown[0][0]

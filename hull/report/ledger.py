@@ -187,7 +187,7 @@ def read_ledger(path: Path) -> Ledger:
     """
     if not path.exists():
         return Ledger(path)
-    table, _ = read_toml(path, "ledger of clashes", ReportError)
+    table, _ = read_toml(path, "clashes", ReportError)
     try:
         told = _LedgerTable.model_validate(table)
     except ValidationError as error:
