@@ -211,11 +211,13 @@ def _calibrate(
     certificate = None
     if session.rig_file is not None:
         rig = take_elsewhere(session, terminal.stage)
+        _make(folder)
     else:
         calibration = calibrate_session(session, terminal.stage, box_world)
         rig = calibration.rig
         volume = working_volume(rig, box_world)
         certificate = certify(rig, calibration.record, calibration.seen, volume)
+        _make(folder)
         _write_certificate(
             folder, session, calibration, certificate, volume, max_error_m, with_page
         )
@@ -230,6 +232,16 @@ def _calibrate(
             click.echo(f"  {no_colmap}")
     if max_error_m is not None:
         _gate(certificate, max_error_m)
+
+
+def _make(folder: Path) -> None:
+    """Make the folder of a rig, once there is one to be written."""
+    from hybridve.calib.errors import CalibrationError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"{folder}: cannot be made ({error.strerror})") from error
 
 
 def _write_colmap(folder: Path, rig: "Rig") -> str | None:
@@ -262,7 +274,6 @@ def _write_certificate(
     text = json.dumps(certificate.to_dict(), indent=1, allow_nan=False) + "\n"
     path = folder / "certificate.json"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         with appearing(path) as partial:
             partial.write_text(text, encoding="utf-8")
     except OSError as error:

@@ -460,6 +460,10 @@ def test_a_rig_with_a_skew_is_taken_without_a_colmap_model_and_that_is_said(
     older.mkdir(parents=True)
     (older / "cameras.txt").write_text("of another rig")
 
+    assert run("calibrate", tmp_path, "-o", tmp_path / "a new" / "folder") == 0
+    assert (tmp_path / "a new" / "folder" / "rig.json").is_file()
+    capsys.readouterr()
+
     assert run("calibrate", tmp_path, "--no-progress") == 0
 
     told = [line for line in capsys.readouterr().out.splitlines() if "COLMAP" in line]
