@@ -297,6 +297,10 @@ def _write_certificate(
     )
 
 
+#: Distances between cameras that are told one by one: of five cameras.
+_MOST_DISTANCES = 10
+
+
 def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
     """Leave with a status of its own if the error is not proved to be small enough."""
     error_m = math.nan if certificate is None or certificate.doubts else certificate.error95_m
@@ -380,8 +384,15 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
                 click.echo(f"    {told.model_chosen.reason}")
             for remark in (*told.warnings, *_counted(told.notes)):
                 click.echo(f"    {remark}")
-    pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in _distances_m(rig).items())
-    if pairs:
+    distances_m = sorted(_distances_m(rig).items(), key=lambda one: one[1])
+    if len(distances_m) > _MOST_DISTANCES:  # of 20 cameras there are 190
+        near, far = (
+            ", ".join(f"{pair} {metres:.3f}" for pair, metres in part)
+            for part in (distances_m[:3], distances_m[-3:])
+        )
+        click.echo(f"  {len(distances_m)} distances, m: {near}, .. {far}; --json has all")
+    elif distances_m:
+        pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in _distances_m(rig).items())
         click.echo(f"  distances, m: {pairs}")
     if record is not None:
         outliers = 0 if record.adjustment is None else record.adjustment.outliers

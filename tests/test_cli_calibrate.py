@@ -584,3 +584,28 @@ def test_pictures_without_the_board_are_one_line(
     expect_no_rig(
         run, capsys, "camera 'cam2': no board of 7x6 inner corners", bare, tmp_path / "rig"
     )
+
+
+def test_of_many_cameras_the_nearest_and_the_farthest_are_told(
+    run: Run, capsys: Captured, tmp_path: Path
+) -> None:
+    lines, tables = [], []
+    for number in range(7):
+        write(tmp_path / f"{number}/0.png", np.zeros(SIZE_PX[::-1], np.uint8))
+        pose = look_at((float(number), -3.0, 1.0), (3.0, 0.0, 0.5))
+        camera = replace(in_front()[0], name=f"cam{number}", cam_from_world=pose)
+        numbers = (camera.pinhole @ pose).ravel().tolist()
+        lines.append(",".join([camera.name, *map(repr, numbers)]))
+        tables.append(f'[[camera]]\nname = "{camera.name}"\nmasks = "{number}/*.png"\n')
+    (tmp_path / "rig.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "session.toml").write_text(
+        'format = "hybridve-session"\nversion = 1\nfps = 25\nrig = "rig.csv"\nrig_unit = "m"\n'
+        + "".join(tables)
+    )
+
+    assert run("calibrate", tmp_path, "--no-progress") == 0
+
+    (told,) = [line for line in capsys.readouterr().out.splitlines() if "distances" in line]
+    assert told.startswith("  21 distances, m: ")
+    assert told.count(" 1.000") == 3  # of neighbours
+    assert told.endswith("cam0 cam6 6.000; --json has all")
