@@ -123,7 +123,8 @@ def main() -> NoReturn:
         context = getattr(error, "ctx", None)
         command = "hybridve" if context is None else context.command_path
         text = error.format_message().rstrip(".")
-        click.echo(f"error: {text}; `{command} --help` shows what there is", err=True)
+        between = "" if text.endswith("?") else ";"
+        click.echo(f"error: {text}{between} `{command} --help` shows what there is", err=True)
         sys.exit(error.exit_code)
     except HybridveError as error:
         for line in error.lines:
