@@ -98,6 +98,12 @@ class BoxMillimetres(click.ParamType["Box"]):
     type=click.Choice(["m", "cm", "mm", "in", "ft", "squares"]),
     help="Unit of RIG's lengths, where its format has none; squares are those of SESSION's target.",
 )
+@click.option(
+    "--pixel-centre",
+    type=click.Choice(["0", "0.5"]),
+    help="Where RIG has the centre of the top-left pixel: 0 (OpenCV) or 0.5 (COLMAP). Default: "
+    "where its format usually has it.",
+)
 @click.option("--no-page", is_flag=True, help="Write no certificate.html, which takes seconds.")
 @options.overwrite_option
 @options.json_option
@@ -109,6 +115,7 @@ def calibrate(
     box_world: "Box | None",
     checked: Path | None,
     rig_unit: str | None,
+    pixel_centre: str | None,
     no_page: bool,
     overwrite: bool,
     as_json: bool,
@@ -135,10 +142,11 @@ def calibrate(
 
     terminal = Terminal(enabled=progress)
     if checked is not None:
-        _check(opened_session(session), checked, rig_unit, terminal, as_json=as_json)
+        _check(opened_session(session), checked, rig_unit, pixel_centre, terminal, as_json=as_json)
         return
-    if rig_unit is not None:
-        raise click.UsageError("--rig-unit goes with --check")
+    for option, value in (("--rig-unit", rig_unit), ("--pixel-centre", pixel_centre)):
+        if value is not None:
+            raise click.UsageError(f"{option} goes with --check")
     folder = output or (session if session.is_dir() else session.parent) / "rig"
     loaded, _ = ask_all(
         lambda: opened_session(session),
@@ -159,7 +167,13 @@ def calibrate(
 
 
 def _check(
-    session: "Session", source: Path, unit: str | None, terminal: Terminal, *, as_json: bool
+    session: "Session",
+    source: Path,
+    unit: str | None,
+    pixel_centre: str | None,
+    terminal: Terminal,
+    *,
+    as_json: bool,
 ) -> None:
     from hybridve.calib.formats.rigs import read_any_rig
     from hybridve.calib.plain import to_json
@@ -170,6 +184,7 @@ def _check(
         source,
         unit=unit,
         square_m=None if session.target is None else session.target.unit_m,
+        pixel_centre=None if pixel_centre is None else float(pixel_centre),
         image_sizes=board_sizes(session),
         names=[camera.name for camera in session.cameras],
     )
@@ -215,8 +230,10 @@ def _calibrate(
     else:
         calibration = calibrate_session(session, terminal.stage, box_world)
         rig = calibration.rig
-        volume = working_volume(rig, box_world)
-        certificate = certify(rig, calibration.record, calibration.seen, volume)
+        volume = working_volume(rig, calibration.boards_world, box_world)
+        certificate = certify(
+            rig, calibration.record, calibration.seen, volume, calibration.boards_world
+        )
         _make(folder)
         _write_certificate(
             folder, session, calibration, certificate, volume, max_error_m, with_page
@@ -416,9 +433,14 @@ def _volume_text(certificate: "Certificate") -> str:
             "xyz", certificate.volume_low_m, certificate.volume_high_m, strict=True
         )
     )
-    return (
+    about = " about the boards, far from where the axes meet"
+    text = (
         f"the working volume: {sides} m, as far as {certificate.volume_min_cameras} cameras see it"
+        f"{about if certificate.volume_about == 'boards' else ''}"
     )
+    if math.isfinite(certificate.boards_error95_m):
+        text += f"; where boards were: good to {millimetres(certificate.boards_error95_m)} mm"
+    return text
 
 
 def _views_of(told: "CameraRecord | None") -> list[str]:

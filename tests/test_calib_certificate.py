@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.boards import board_poses, observe_exactly, project, ring
+from helpers.boards import board_poses, look_at, observe_exactly, project, ring
 from helpers.records import make_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -167,3 +167,42 @@ def test_cameras_with_one_view_are_a_doubt() -> None:
     assert "'cam2' and 'again' stand in one place and have one view" in doubt
     assert certificate.verdict.startswith("not to be trusted: ")
     assert certified(with_covariance(CAMERAS, {})).doubts == ()
+
+
+def test_of_cameras_that_look_one_way_the_volume_lies_where_the_boards_were() -> None:
+    """Axes that are 1 degree apart meet 29 m away; the boards were 2 m before the cameras."""
+    boards_world = np.random.default_rng(1).uniform((-0.3, 1.7, -0.3), (0.3, 2.3, 0.3), (60, 3))
+    cameras = [
+        replace(
+            CAMERAS[0],
+            name=name,
+            cam_from_world=look_at(
+                (x_m, 0.0, 0.0), (0.0, 0.25 / float(np.tan(np.radians(0.5))), 0.0)
+            ),
+        )
+        for name, x_m in (("left", -0.25), ("right", 0.25))
+    ]
+    rig = with_covariance(cameras, {("left tx", "left tx"): 1e-6})
+
+    far = working_volume(rig)
+    near = working_volume(rig, boards_world)
+
+    assert far.about == "axes"
+    assert far.low_world[1] > boards_world[:, 1].max()
+    assert near.about == "boards"
+    assert (near.low_world < boards_world.min(axis=0)).all()
+    assert (near.high_world > boards_world.max(axis=0)).all()
+    # The nearer of two places has the smaller error where depth is what is not known.
+    told = certify(rig, make_record(["left", "right"]), {}, near, boards_world)
+    assert told.boards_error95_m <= told.largest_error95_m
+    assert told.boards_error95_m < certified(rig).error95_m / 5.0
+
+
+def test_where_axes_meet_about_the_boards_the_volume_is_what_the_cameras_look_at() -> None:
+    rig = Rig(tuple(CAMERAS))
+    middle = working_volume(rig).points_world.mean(axis=0)
+
+    about = working_volume(rig, middle + np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]]))
+
+    assert about.about == "axes"
+    assert np.array_equal(about.points_world, working_volume(rig).points_world)

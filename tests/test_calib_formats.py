@@ -259,6 +259,23 @@ def test_the_name_in_a_topic_goes_before_the_place_in_the_chain(tmp_path: Path) 
     assert taken["cam1"].model == "PINHOLE"
 
 
+def test_a_unit_that_is_not_the_files_own_is_taken_and_that_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = rig_of("PINHOLE", "EUCM")
+    export_rig(rig, "kalibr", tmp_path / "chain.yaml")  # metres, by definition
+
+    read_any_rig(tmp_path / "chain.yaml", unit="m")
+    assert not caplog.messages
+    taken = read_any_rig(tmp_path / "chain.yaml", unit="mm")
+
+    (said,) = caplog.messages
+    assert "kalibr has its lengths in m; they are taken in mm, as was asked" in said
+    apart_m = np.linalg.norm(rig.centers_world[1] - rig.centers_world[0])
+    found_m = np.linalg.norm(taken.centers_world[1] - taken.centers_world[0])
+    assert found_m == pytest.approx(0.001 * apart_m)
+
+
 def test_multicals_relative_poses_are_linked_from_an_absolute_one(tmp_path: Path) -> None:
     # x_a = R x_b + T for "a_to_b", as multical's export has it.
     rng = np.random.default_rng(5)

@@ -343,7 +343,7 @@ def test_cameras_on_both_sides_of_a_printed_glass_stand_where_they_are() -> None
     assert (true[:2, 2] > 0).all()
     assert (true[2:, 2] < 0).all()
     # The volume that they are judged in is on both sides of the sheet.
-    volume = working_volume(calibration.rig)
+    volume = working_volume(calibration.rig, calibration.boards_world)
     assert volume.low_world[2] < 0 < volume.high_world[2]
 
 

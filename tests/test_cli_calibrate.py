@@ -381,6 +381,7 @@ def test_the_volume_is_the_one_that_is_asked_for(
         ["--volume-mm", "10,0,0:0,10,10"],
         ["--max-error-mm", "0"],
         ["--rig-unit", "mm"],
+        ["--pixel-centre", "0"],
     ],
 )
 def test_wrong_usage_is_status_2(
@@ -436,7 +437,15 @@ def test_a_rig_in_squares_and_without_sizes_is_checked_by_the_session_that_has_b
     in_squares = ("--check", rig, path, "--rig-unit", "squares", "--no-progress", "--json")
     assert run("calibrate", *in_squares) == 0
 
-    assert json.loads(capsys.readouterr().out)["scale"] == pytest.approx(1.0, abs=0.01)
+    told = json.loads(capsys.readouterr().out)
+    assert told["scale"] == pytest.approx(1.0, abs=0.01)
+
+    # OpenCV's pixel centres lie at 0; read as COLMAP's, each camera's image is half a pixel off.
+    assert run("calibrate", *in_squares, "--pixel-centre", "0") == 0
+    assert json.loads(capsys.readouterr().out)["rms_px"] == told["rms_px"]
+    run("calibrate", *in_squares, "--pixel-centre", "0.5")
+    shifted = json.loads(capsys.readouterr().out)["rms_px"]
+    assert max(shifted.values()) > max(told["rms_px"].values())
 
 
 # --- Rigs made elsewhere --------------------------------------------------------------------

@@ -279,7 +279,7 @@ def test_a_volume_that_nobody_sees_has_a_page(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
     rig, _, seen, _ = two
-    volume = Volume(np.zeros((0, 3)), np.zeros(3), np.ones(3), 2)
+    volume = Volume(np.zeros((0, 3)), np.zeros(3), np.ones(3), 2, "asked")
     certificate = certify(rig, record_of(rig), seen, volume)
 
     page = page_of(tmp_path, (rig, certificate, seen, volume))
@@ -481,7 +481,7 @@ def test_residuals_of_rounding_are_told_as_none(
 def test_slices_hold_the_error_of_their_places_and_blanks_where_too_few_see() -> None:
     rig, _, _, volume = case_of(["a", "b", "c"])
     low, high = np.array([-0.9, -0.2, 0.1]), np.array([1.0, 0.5, 0.9])
-    volume = Volume(volume.points_world, low, high, 3)
+    volume = Volume(volume.points_world, low, high, 3, "asked")
 
     x, y, z, errors_m = slice_errors(rig, volume)
 

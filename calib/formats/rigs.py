@@ -5,6 +5,7 @@ where its pixel centres lie, the images' size) is given by the caller, never gue
 """
 
 import json
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -40,6 +41,8 @@ from hybridve.calib.pose import nearest_to_axes
 from hybridve.calib.provenance import MadeElsewhere
 from hybridve.calib.record import CalibrationRecord
 from hybridve.calib.rig import Rig, RigCovariance
+
+_log = logging.getLogger(__name__)
 
 #: What is read, in words, for whoever comes with another file.
 _READ = (
@@ -187,6 +190,14 @@ def _to_rig(
                 f"{', '.join(UNITS_M)}"
             )
         factor_m = metres_of(unit, None)
+    elif found.unit is not None and factor_m != metres_of(found.unit, None):
+        _log.warning(
+            "%s: %s has its lengths in %s; they are taken in %s, as was asked",
+            pattern,
+            found.format,
+            found.unit,
+            unit,
+        )
     chosen = {name: _foreign(found, name, pattern) for name in image_sizes}
     _refuse_mirrored(found, chosen, pattern)
     cameras = []

@@ -1,6 +1,7 @@
 """What a calibration tells: the rig, and as plain values where its numbers come from."""
 
 import importlib.metadata
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -8,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.boards.board import Board, Observations, is_seen
-from hybridve.calib.judging.certificate import SeenPoints, working_volume
+from hybridve.calib.judging.certificate import NO_BOARDS, SeenPoints, working_volume
 from hybridve.calib.placing.fixed_cameras import Solved, other_tilt
 from hybridve.calib.placing.moments import PoseKey
 from hybridve.calib.placing.moving_cameras import Mounted
 from hybridve.calib.placing.settings import CalibrationSettings
+from hybridve.calib.pose import compose, transform
 from hybridve.calib.record import (
     METHOD,
     Adjustment,
@@ -48,11 +50,14 @@ class Calibration:
         Errors per camera, what was decided, dropped and doubted, and why.
     seen : dict of str to SeenPoints
         By camera all points that were used, and by how much the rig misses them.
+    boards_world : (K, 3) float64
+        Where points of boards were that two cameras or more saw at once, metres.
     """
 
     rig: Rig
     record: CalibrationRecord
     seen: dict[str, SeenPoints]
+    boards_world: NDArray[np.float64]
 
 
 def put_together(
@@ -111,8 +116,10 @@ def put_together(
         mounts={one.camera.name: one.mount for one in mounted},
     )
     opinion = None
+    boards_world = NO_BOARDS
     if solved is not None:
-        volume = working_volume(rig, settings.box_world)
+        boards_world = _common_boards(solved)
+        volume = working_volume(rig, boards_world, settings.box_world)
         opinion = second_opinion(rig, solved.second, volume.points_world)
     record = CalibrationRecord(
         method=METHOD,
@@ -132,7 +139,22 @@ def put_together(
         adjustment=None if solved is None else _told_of_adjustment(solved),
         second_opinion=opinion,
     )
-    return Calibration(replace(rig, provenance=record), record, used)
+    return Calibration(replace(rig, provenance=record), record, used, boards_world)
+
+
+def _common_boards(solved: Solved) -> NDArray[np.float64]:
+    """Return the points (K, 3), world, of boards that two cameras or more saw at once."""
+    bundle = solved.adjusted.bundle
+    cameras_of: defaultdict[tuple[int, int], set[int]] = defaultdict(set)
+    for view in bundle.views:
+        cameras_of[view.pose, view.board].add(view.camera)
+    places = [NO_BOARDS]
+    for (pose, board), cameras in cameras_of.items():
+        if len(cameras) > 1:
+            rig_from_board = compose(bundle.rig_from_body[pose], bundle.body_from_board[board])
+            world_from_board = compose(solved.world_from_rig, rig_from_board)
+            places.append(transform(world_from_board, bundle.points_board[board]))
+    return np.concatenate(places)
 
 
 def _told_of_adjustment(solved: Solved) -> Adjustment:

@@ -38,6 +38,12 @@ _VOLUME_POINTS = 13
 #: share of the cameras' median distance from it.
 _VOLUME_REACH = 0.6
 
+#: Of a rig of which it is not known where boards were.
+NO_BOARDS = np.zeros((0, 3))
+
+#: Points of boards at which errors are asked.
+_BOARD_POINTS = 500
+
 #: With fewer points than this share of the grid seen by all cameras, those seen by two count.
 _SEEN_BY_ALL = 0.02
 
@@ -107,12 +113,15 @@ class Volume:
         The box around it.
     min_cameras : int
         How many cameras see each of its points at least.
+    about : str
+        What chose it: "asked", "axes" (where the cameras look), or "boards" (where boards were).
     """
 
     points_world: NDArray[np.float64]
     low_world: NDArray[np.float64]
     high_world: NDArray[np.float64]
     min_cameras: int
+    about: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +205,11 @@ class Certificate:
         The box around the working volume, metres, world.
     volume_min_cameras : int
         How many cameras see each point of it at least.
+    volume_about : str
+        What chose it: "asked", "axes" (where the cameras look), or "boards" (where boards were).
+    boards_error95_m : float
+        The error of a point (95 %) that 95 % of the points keep at which boards were when two
+        cameras or more saw them at once; NaN where none were.
     noise : Noise
         How noisy the points of boards were.
     cameras : tuple of CameraCertificate
@@ -218,6 +232,8 @@ class Certificate:
     volume_low_m: tuple[float, ...]
     volume_high_m: tuple[float, ...]
     volume_min_cameras: int
+    volume_about: str
+    boards_error95_m: float
     noise: Noise
     cameras: tuple[CameraCertificate, ...]
     limit: Limit | None
@@ -233,26 +249,35 @@ class Certificate:
 
 def working_volume(
     rig: Rig,
+    boards_world: NDArray[np.float64] = NO_BOARDS,
     box_world: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     has_floor: bool = True,
 ) -> Volume:
     """Return where a rig is judged: what all its cameras see around the point they look at.
 
+    Of cameras that look nearly the same way that point is anybody's guess. Where the boards were
+    not near it, the volume lies about them instead: nothing is known of how good the rig is
+    elsewhere that work at the boards' place would be judged by.
+
     Parameters
     ----------
     rig : Rig
         The cameras.
+    boards_world : (K, 3) float64
+        Where points of boards were that two cameras or more saw at once, metres; none where that
+        is not known.
     box_world : two (3,) float64, optional
         The lowest and the highest corner of the volume instead, metres.
     has_floor : bool
         Whether nothing below z = 0 counts. A camera that stands there says that there is none.
     """
+    about = "axes" if box_world is None else "asked"
     if box_world is None:
-        middle = _look_at(rig)
-        reach_m = _VOLUME_REACH * float(
-            np.median(np.linalg.norm(rig.centers_world - middle, axis=1))
-        )
-        low, high = middle - reach_m, middle + reach_m
+        low, high = _box_about(rig, _look_at(rig))
+        if len(boards_world):
+            middle = np.median(boards_world, axis=0)
+            if not ((low <= middle) & (middle <= high)).all():
+                about, (low, high) = "boards", _box_about(rig, middle)
         if has_floor and high[2] > 0 and (rig.centers_world[:, 2] > 0).all():
             low[2] = max(low[2], 0.0)
     else:
@@ -268,7 +293,16 @@ def working_volume(
     points = grid[n_seeing >= min_cameras]
     if len(points):
         low, high = points.min(axis=0), points.max(axis=0)
-    return Volume(points, np.asarray(low), np.asarray(high), min_cameras)
+    return Volume(points, np.asarray(low), np.asarray(high), min_cameras, about)
+
+
+def _box_about(
+    rig: Rig, middle: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and the highest corner of the volume about a point."""
+    distances_m = np.linalg.norm(rig.centers_world - middle, axis=1)
+    reach_m = _VOLUME_REACH * float(np.median(distances_m))
+    return middle - reach_m, middle + reach_m
 
 
 def _look_at(rig: Rig) -> NDArray[np.float64]:
@@ -293,7 +327,11 @@ def _look_at(rig: Rig) -> NDArray[np.float64]:
 
 
 def certify(
-    rig: Rig, record: CalibrationRecord, seen: Mapping[str, SeenPoints], volume: Volume
+    rig: Rig,
+    record: CalibrationRecord,
+    seen: Mapping[str, SeenPoints],
+    volume: Volume,
+    boards_world: NDArray[np.float64] = NO_BOARDS,
 ) -> Certificate:
     """Return the verdict on a rig.
 
@@ -307,11 +345,13 @@ def certify(
         By camera what it saw of the boards.
     volume : Volume
         Where the rig is judged.
+    boards_world : (K, 3) float64
+        Where points of boards were that two cameras or more saw at once, metres.
     """
-    errors_m = point_errors(rig, volume.points_world).radius95_m
-    errors_m = errors_m[np.isfinite(errors_m)]
+    errors_m = _finite_errors(rig, volume.points_world)
     has_errors = len(errors_m) > 0
     error95_m = float(np.quantile(errors_m, _SHARE)) if has_errors else np.nan
+    at_boards_m = _finite_errors(rig, boards_world[:: max(len(boards_world) // _BOARD_POINTS, 1)])
     limit = find_limit(rig, volume) if has_errors else None
     cameras = tuple(
         _certify_camera(rig, index, seen.get(camera.name), volume)
@@ -329,6 +369,8 @@ def certify(
         volume_low_m=tuple(float(value) for value in volume.low_world),
         volume_high_m=tuple(float(value) for value in volume.high_world),
         volume_min_cameras=volume.min_cameras,
+        volume_about=volume.about,
+        boards_error95_m=float(np.quantile(at_boards_m, _SHARE)) if len(at_boards_m) else np.nan,
         noise=record.noise,
         cameras=cameras,
         limit=limit,
@@ -336,6 +378,14 @@ def certify(
         doubts=doubts,
         second_opinion=record.second_opinion,
     )
+
+
+def _finite_errors(rig: Rig, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the errors (95 %, metres) of those of points (N, 3) that two cameras see."""
+    if not len(points_world):
+        return np.zeros(0)
+    errors_m = point_errors(rig, points_world).radius95_m
+    return errors_m[np.isfinite(errors_m)]
 
 
 def find_limit(rig: Rig, volume: Volume) -> Limit | None:
