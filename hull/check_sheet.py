@@ -55,7 +55,7 @@ def _image(session: Session, camera: SessionCamera, frame: int) -> Image | None:
     """Return a camera's picture of a frame of the session; None of ready masks."""
     if camera.has_masks:
         return None
-    at = frame - camera.shift_frames
+    at = frame - camera.nearest_shift
     found = next(recording_of(session, camera).frames_or_errors(at, at + 1), None)
     return None if found is None or isinstance(found, SessionError) else found
 

@@ -217,7 +217,7 @@ def _images(session: Session, camera: SessionCamera, index: int) -> Iterator[Ima
 
     Masks may be of any values; what they are in colours, if they are in colours, is shown as it is.
     """
-    number = index - camera.shift_frames
+    number = index - camera.nearest_shift
     for image in recording_of(session, camera).frames(number, number + 1):
         if not camera.has_masks:
             yield image

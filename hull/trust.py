@@ -132,7 +132,10 @@ def judge_cameras(
         found = judge_session(
             views,
             frames,
-            offset_s={camera.name: camera.shift_frames / session.fps for camera in session.cameras},
+            offset_s={
+                camera.name: (camera.shift_frames + camera.lag) / session.fps
+                for camera in session.cameras
+            },
             fps=session.fps,
         )
     if not frames:

@@ -290,3 +290,69 @@ def test_pictures_without_a_rate_are_told(tmp_path: Path, caplog: pytest.LogCapt
         assert load_session(path).fps == 30.0
 
     assert "fps: this key is missing" in caplog.text
+
+
+# --- A clock that is late by a share of a frame ---------------------------------------------------
+
+
+def late_ball_session(folder: Path, by_frames: float) -> Path:
+    """Write the ball's session; cam1 took each picture so many frames late, and says so."""
+    session = write_ball_session(folder, CENTERS)
+    step = CENTERS[1] - CENTERS[0]
+    write_ball_session(folder / "late", CENTERS + by_frames * step)
+    for number in range(len(CENTERS)):
+        (folder / "late" / "cam1" / f"{number}.png").replace(folder / "cam1" / f"{number}.png")
+    text = session.read_text(encoding="utf-8")
+    key = 'name = "cam1"\n'
+    assert key in text
+    late = f"{key}offset_s = {by_frames / load_session(session).fps}\n"
+    session.write_text(text.replace(key, late), encoding="utf-8")
+    return session
+
+
+@pytest.mark.parametrize("by_frames", [0.4, 1.7, -0.25])
+@pytest.mark.parametrize("step", [1, 3])
+def test_a_clock_that_is_late_by_a_share_of_a_frame_sees_what_was_between(
+    tmp_path: Path, by_frames: float, step: int
+) -> None:
+    """The ball moves by a fifth of its diameter a frame; what it covers is known at all times."""
+    expected = masks_of(write_ball_session(tmp_path / "in step", CENTERS))
+    session = load_session(late_ball_session(tmp_path / "late", by_frames))
+
+    frames = list(segmented_frames(session, FrameRange(0, None, step)))
+
+    assert session.cameras[1].shift_frames + session.cameras[1].lag == pytest.approx(by_frames)
+    assert [frame.index for frame in frames][:3] == [0, step, 2 * step]
+    n_read = 0
+    for frame in frames:
+        before = frame.index - by_frames
+        if frame.masks is None:
+            is_between = 0 <= np.floor(before) <= np.ceil(before) < len(CENTERS)
+            assert not (is_between and frame.index < len(CENTERS))
+            assert "has not begun" in frame.reason or "has stopped" in frame.reason
+            continue
+        n_read += 1
+        truth = expected[frame.index]
+        assert not isinstance(truth, str)
+        wrong = (frame.masks[1] != truth[1]).sum()
+        # The outline is a pixel wide, and no more than it is open to doubt.
+        outline = cv2.morphologyEx(truth[1], cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).sum()
+        assert wrong <= outline / 4
+        np.testing.assert_array_equal(frame.masks[0], truth[0])
+    assert n_read >= 5 if step == 1 else n_read >= 2
+
+
+def test_a_camera_that_moves_is_not_asked_between_its_pictures(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    session = late_ball_session(tmp_path, 1.4)
+    (tmp_path / "poses.csv").write_text("frame,x,y,z,qw,qx,qy,qz\n", encoding="utf-8")
+    text = session.read_text(encoding="utf-8")
+    session.write_text(
+        text.replace('name = "cam1"\n', 'name = "cam1"\nposes = "poses.csv"\n'), encoding="utf-8"
+    )
+
+    camera = load_session(session).cameras[1]
+
+    assert (camera.shift_frames, camera.lag) == (1, 0.0)
+    assert "camera 'cam1' moves, and its offset_s is 1.40 frames, not a whole" in caplog.text

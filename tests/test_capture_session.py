@@ -61,10 +61,19 @@ def test_the_root_may_name_the_environment_with_a_default(
         load_session(path)
 
 
-def test_a_late_clock_becomes_a_whole_number_of_frames(folder: Path) -> None:
-    session = load_session(session_path(folder, HEAD + CAMERA + "offset_s = 0.121\n"))
+@pytest.mark.parametrize(
+    ("offset_s", "shift_frames", "lag"),
+    [(0.12, 3, 0.0), (0.1205, 3, 0.0), (0.136, 3, 0.4), (-0.01, -1, 0.75), (-0.08, -2, 0.0)],
+)
+def test_a_late_clock_is_late_by_frames_and_a_share_of_one(
+    folder: Path, offset_s: float, shift_frames: int, lag: float
+) -> None:
+    session = load_session(session_path(folder, HEAD + CAMERA + f"offset_s = {offset_s}\n"))
 
-    assert session.cameras[0].shift_frames == 3
+    (camera,) = session.cameras
+    assert camera.shift_frames == shift_frames
+    assert camera.lag == pytest.approx(lag)
+    assert camera.nearest_shift == round(25.0 * offset_s)
 
 
 @pytest.mark.parametrize(

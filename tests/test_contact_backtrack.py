@@ -11,6 +11,13 @@ from helpers.hulls import ball_hull, ball_masks, ring_views, sphere_mesh
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.scene import SceneObject
+from hybridve.hull.capture.outline_motion import (
+    distances_where,
+    follow_outline,
+    interpolate_masks,
+    signed_distance_px,
+)
+from hybridve.hull.capture.pixel_boxes import slices_of
 from hybridve.hull.contact.backtrack import FirstContact, _patch, approach_speed, first_contact
 from hybridve.hull.contact.between import interpolated_hull
 from hybridve.hull.contact.detect import (
@@ -19,13 +26,6 @@ from hybridve.hull.contact.detect import (
     detect_contacts,
     make_body,
 )
-from hybridve.hull.contact.outline_motion import (
-    distances_where,
-    follow_outline,
-    interpolate_masks,
-    signed_distance_px,
-)
-from hybridve.hull.contact.pixel_boxes import slices_of
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points

@@ -10,11 +10,12 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -27,6 +28,7 @@ from hybridve.calib.image_io import FrameSource, Image
 from hybridve.calib.lens import Undistortion, cam_from_img
 from hybridve.hull.capture.background import learn_background
 from hybridve.hull.capture.mask_values import MASK_METHOD, MaskReading, reading_of
+from hybridve.hull.capture.outline_motion import interpolate_masks
 from hybridve.hull.capture.segment import METHOD_VERSION, Segmenter
 from hybridve.hull.capture.session import Session, SessionCamera
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
@@ -310,7 +312,7 @@ def silhouette_stamp(session: Session, rig_digest: str | None) -> str:
             "segmentation": asdict(session.segmentation),
             "masks": [session.mask_threshold, session.mask_channel, MASK_METHOD],
             "rig": rig_digest,
-            "shift_frames": [camera.shift_frames for camera in session.cameras],
+            "shift_frames": [camera.shift_frames + camera.lag for camera in session.cameras],
             "files": files,
         }
     )
@@ -503,7 +505,31 @@ class _Lane(threading.Thread):
         return False
 
     def _cuts(self) -> Iterator[_Cut]:
+        """Yield the camera's part of each frame; between two pictures where its clock lags."""
         frames, shift = self._frames, self._camera.shift_frames
+        if not self._camera.lag:
+            yield from self._pictures(frames, shift)
+            return
+        pairs: Iterable[tuple[_Cut, _Cut]]
+        if frames.step == 1:
+            stop = None if frames.stop is None else frames.stop + 1
+            pairs = pairwise(self._pictures(replace(frames, stop=stop), shift + 1))
+        else:
+            later = self._pictures(frames, shift)
+            pairs = zip(self._pictures(frames, shift + 1), later, strict=False)
+        for before, after in pairs:
+            yield self._between(before, after)
+
+    def _between(self, before: _Cut, after: _Cut) -> _Cut:
+        """Return the silhouette of an instant between two pictures."""
+        if before.mask is None or after.mask is None:
+            return after if after.mask is None else replace(before, decode_s=after.decode_s)
+        started = time.thread_time()
+        (mask,) = interpolate_masks([before.mask], [after.mask], 1.0 - self._camera.lag)
+        return replace(after, mask=mask, segment_s=after.segment_s + time.thread_time() - started)
+
+    def _pictures(self, frames: FrameRange, shift: int) -> Iterator[_Cut]:
+        """Yield the silhouette of each picture: of the k-th of the camera at frame k + shift."""
         first = frames.start
         while first < shift and (frames.stop is None or first < frames.stop):
             yield _Cut(None, f"camera {self._camera.name!r} has not begun to record")

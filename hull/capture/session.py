@@ -7,6 +7,7 @@ mistake is told before any work starts. Frames themselves are read later, one at
 
 import hashlib
 import logging
+import math
 import statistics
 from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
@@ -34,6 +35,10 @@ from hybridve.hull.capture.session_tables import (
 from hybridve.hull.toml_io import expand_root, explain_validation, like, read_toml
 
 _log = logging.getLogger(__name__)
+
+#: A clock that is off a whole number of frames by less than this, in frames, is off by that number:
+#: silhouettes between two pictures are known less well than that moves them.
+_SAME_INSTANT = 0.02
 
 #: Frames a second where nobody says; and two rates are the same up to this factor.
 _NO_RATE, _SAME_RATE = 30.0, 1.01
@@ -78,8 +83,9 @@ class SessionCamera:
     has_masks : bool
         Whether `recording` holds silhouettes.
     shift_frames : int
-        How many frames after the others this camera's clock started: its frame k was recorded at
-        the session's frame k + shift_frames.
+    lag : float
+        How many frames after the others this camera's clock started, whole ones and a share from 0
+        up to 1: its frame k was recorded at the session's frame k + shift_frames + lag.
     lens : str or None
         Cameras with the same lens have the same intrinsics.
     params : tuple of float, or None
@@ -98,10 +104,16 @@ class SessionCamera:
     recording: FrameSource | None
     has_masks: bool
     shift_frames: int
+    lag: float = 0.0
     lens: str | None = None
     params: tuple[float, ...] | None = None
     poses: Path | None = None
     extrinsics_poses: Path | None = None
+
+    @property
+    def nearest_shift(self) -> int:
+        """The shift that takes a frame of the session to the nearest picture of this camera."""
+        return self.shift_frames + (self.lag >= 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +257,7 @@ def load_session(path: Path) -> Session:
     )
     fps = _rate_of(parsed, cameras, path)
     cameras = tuple(
-        replace(camera, shift_frames=round(table.offset_s * fps))
+        _late(camera, table.offset_s * fps, path)
         for camera, table in zip(cameras, parsed.camera, strict=True)
     )
     rig_file = None
@@ -482,6 +494,25 @@ def _rate_of(parsed: SessionTable, cameras: tuple[SessionCamera, ...], path: Pat
 def _as_stored(source: FrameSource | None) -> FrameSource | None:
     """Return masks as what their files hold; what that means is found from them."""
     return None if source is None else replace(source, is_raw=True)
+
+
+def _late(camera: SessionCamera, by_frames: float, path: Path) -> SessionCamera:
+    """Return a camera whose clock started so many frames after the others'."""
+    nearest = round(by_frames)
+    if abs(by_frames - nearest) < _SAME_INSTANT:
+        return replace(camera, shift_frames=nearest)
+    if camera.poses is not None:
+        # What it saw between two frames it saw from a place between two.
+        _log.warning(
+            "%s: camera %r moves, and its offset_s is %.2f frames, not a whole number: taken as %d",
+            path,
+            camera.name,
+            by_frames,
+            nearest,
+        )
+        return replace(camera, shift_frames=nearest)
+    whole = math.floor(by_frames)
+    return replace(camera, shift_frames=whole, lag=by_frames - whole)
 
 
 def _find_files(

@@ -39,16 +39,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.between import Between
-from hybridve.hull.contact.detect import Body, Contact
-from hybridve.hull.contact.outline_motion import CAP_PX, OUTLINE_PX, Outline, signed_distance_px
-from hybridve.hull.contact.pixel_boxes import (
+from hybridve.hull.capture.outline_motion import CAP_PX, OUTLINE_PX, Outline, signed_distance_px
+from hybridve.hull.capture.pixel_boxes import (
     contains,
     grown_box,
     intersection,
     slices_of,
-    windows_of,
 )
+from hybridve.hull.contact.between import Between
+from hybridve.hull.contact.detect import Body, Contact
+from hybridve.hull.contact.windows import windows_of
 from hybridve.hull.query.certify import COLLIDING, Certifier
 from hybridve.hull.query.engine import Engine
 from hybridve.hull.query.reference import contains_points

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.outline_motion import Outline, follow_outline
-from hybridve.hull.contact.pixel_boxes import Box
+from hybridve.hull.capture.outline_motion import Outline, follow_outline
+from hybridve.hull.capture.pixel_boxes import Box
 from hybridve.hull.query.silhouettes import Hull, Views, interpolated_views, make_hull
 from hybridve.hull.query.threads import Threads
 

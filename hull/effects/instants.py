@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.motion import Motion
+from hybridve.hull.capture.outline_motion import Outline
+from hybridve.hull.capture.pixel_boxes import box_of, grown_box, intersection, is_empty, slices_of
 from hybridve.hull.contact.between import Between
-from hybridve.hull.contact.outline_motion import Outline
-from hybridve.hull.contact.pixel_boxes import box_of, grown_box, intersection, is_empty, slices_of
 from hybridve.hull.effects.effect import Course, Instant
 from hybridve.hull.query.silhouettes import Hull, Views
 from hybridve.hull.query.threads import Threads

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.scene import SceneObject
+from hybridve.hull.capture.outline_motion import interpolate_masks
 from hybridve.hull.contact.backtrack import approach_speed, first_contact
 from hybridve.hull.contact.between import interpolated_hull
 from hybridve.hull.contact.detect import certify_contacts, detect_contacts, make_body
-from hybridve.hull.contact.outline_motion import interpolate_masks
 from hybridve.hull.query.certify import Certifier
 from hybridve.hull.query.native import Native
 from hybridve.hull.query.reference import contains_points

@@ -1,13 +1,8 @@
 """Boxes of pixels: rows and columns from one up to another."""
 
-import itertools
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from hybridve.hull.contact.detect import Body
-from hybridve.hull.query.silhouettes import Views
 
 #: A part of an image: rows and columns, both from the first to the one after the last.
 Box = tuple[int, int, int, int]
@@ -53,21 +48,3 @@ def box_of(mask: NDArray[np.uint8]) -> Box:
     """Return the box of the pixels that are not 0."""
     left, top, width, height = cv2.boundingRect(mask)
     return top, top + height, left, left + width
-
-
-def windows_of(views: Views, body: Body) -> list[Box]:
-    """Return for each camera a box that the object projects into, with some pixels to spare."""
-    ends_world = np.stack([body.lower_world, body.upper_world])
-    corners_world = np.array(list(itertools.product(*ends_world.T)))  # (8, 3)
-    windows = []
-    for camera, (width, height) in enumerate(views.sizes_px.tolist()):
-        whole = (0, height, 0, width)
-        projected = views.project(corners_world, camera)  # (8, 3)
-        if projected[:, 2].min() <= 1e-6:
-            windows.append(whole)  # part of it is behind the camera
-            continue
-        pixels = projected[:, :2] / projected[:, 2:]
-        left, top = np.clip(np.floor(pixels.min(axis=0)) - 2, 0, (width, height)).tolist()
-        right, bottom = np.clip(np.ceil(pixels.max(axis=0)) + 2, 0, (width, height)).tolist()
-        windows.append((int(top), int(bottom), int(left), int(right)))
-    return windows

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.contact.pixel_boxes import (
+from hybridve.hull.capture.pixel_boxes import (
     Box,
     box_of,
     grown_box,
