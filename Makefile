@@ -1,5 +1,6 @@
 # make demo    the whole job on a generated session
 # make test    everything that must hold: style, types, import contracts, tests
+# make thorough  the tests with all their cases and examples, of which make test asks some
 # make quick   under a minute of the tests: of each one that is quick the first case
 # make coverage  what share of the lines the tests run; compiled loops are not counted
 # make oldest  the quick tests with the oldest dependencies that pyproject.toml allows
@@ -12,13 +13,13 @@
 BIN := .venv/bin
 
 # As many processes run as there are cores: threads of linear algebra in each would fight.
-pytest quick coverage oldest soak bench theory hard-cases: export OPENBLAS_NUM_THREADS = 1
+pytest thorough quick coverage oldest soak bench theory hard-cases: export OPENBLAS_NUM_THREADS = 1
 
 # Compiled modules are kept whatever the shell says: compiling them anew costs each process 5 s, and
 # each command that a test starts its share.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check pytest quick coverage oldest soak bench theory hard-cases lock setup clean
+.PHONY: demo test check pytest thorough quick coverage oldest soak bench theory hard-cases lock setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -35,6 +36,11 @@ check: setup
 # Files of tests side by side; one file stays with one process, so that fixtures are made once.
 # Property tests are asked the same examples in every run, on every machine.
 pytest: setup
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable
+
+thorough coverage soak: export HYBRIDVE_TESTS = thorough
+
+thorough: setup
 	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable
 
 quick: setup

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.thorough import THOROUGH, asked
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 
@@ -24,6 +25,7 @@ _NOT_QUICK = ("slow", "recording", "hypothesis")
 # compiles in its first example: no example has a time limit, nor has the drawing of it.
 settings.register_profile(
     "same",
+    max_examples=asked(100),
     deadline=None,
     derandomize=True,
     database=None,
@@ -55,10 +57,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with the files that take longest, lest one process be left with them at the end.
 
-    With --quick leave out what takes long, recordings, drawn examples, and all but one case.
+    Leave out what only `make thorough` asks. With --quick leave out what takes long, recordings,
+    drawn examples, and all but one case.
     """
     long = {item.path for item in items if item.get_closest_marker("recording")}
     items.sort(key=lambda item: item.path not in long)
+    if not THOROUGH:
+        left_out = [item for item in items if item.get_closest_marker("thorough")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("thorough")]
     if not config.getoption("--quick"):
         return
     quick: dict[str, pytest.Item] = {}

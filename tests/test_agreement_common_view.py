@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.agreement import random_views
 from helpers.hulls import look_at, projection, ring_views
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -99,7 +100,7 @@ def test_parallel_cameras_come_together_nowhere() -> None:
     unseen=st.sampled_from(["carve", "keep"]),
     spread_m=st.sampled_from([0.0, 2.0, 5.0]),
 )
-@settings(max_examples=100)
+@settings(max_examples=asked(100))
 def test_a_common_view_is_found_or_there_is_none(
     seed: int, n_cameras: int, unseen: Unseen, spread_m: float
 ) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.agreement import Masks, balls, random_views, shifted
 from helpers.hulls import ball_masks, look_at, projection, ring_views
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -262,7 +263,7 @@ def test_nothing_is_disputed_where_one_camera_does_not_see() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(2, 6), error_px=st.integers(1, 5))
-@settings(max_examples=100)
+@settings(max_examples=asked(100))
 def test_outlines_within_their_errors_never_contradict(
     seed: int, n_cameras: int, error_px: int
 ) -> None:
@@ -295,7 +296,7 @@ def test_outlines_within_their_errors_never_contradict(
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(1, 6), keep=st.booleans())
-@settings(max_examples=60)
+@settings(max_examples=asked(60))
 def test_whatever_is_told_holds(seed: int, n_cameras: int, keep: bool) -> None:
     rng = np.random.default_rng(seed)
     unseen, min_cameras = ("keep", int(rng.integers(1, n_cameras + 1))) if keep else ("carve", 1)

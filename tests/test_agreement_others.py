@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.agreement import random_views, shifted
 from helpers.hulls import ball_hull, ball_masks, ring_views
+from helpers.thorough import asked
 from helpers.view_scene import cone_intersections
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -123,7 +124,7 @@ def test_a_single_camera_has_no_others() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@settings(max_examples=asked(15))
 @given(seed=st.integers(0, 2**32 - 1), unseen=st.sampled_from(["carve", "keep"]))
 def test_rays_that_are_followed_say_the_same(seed: int, unseen: str) -> None:
     rng = np.random.default_rng(seed)

@@ -3,6 +3,7 @@
 import numpy as np
 from helpers.hulls import with_gaps
 from helpers.sessions import SIZE_PX, ball_mask, ring_matrix
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ def test_a_thing_smaller_than_the_witness_rays_are_apart_is_not_lost() -> None:
     assert [int(mask.sum()) for mask in result] == [1] * N_CAMERAS
 
 
-@settings(max_examples=25)
+@settings(max_examples=asked(25))
 @given(seed=st.integers(0, 2**32 - 1), unseen=st.sampled_from(["carve", "keep", "gaps"]))
 def test_the_hull_is_the_same_at_every_point(seed: int, unseen: str) -> None:
     rng = np.random.default_rng(seed)

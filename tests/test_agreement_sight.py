@@ -5,6 +5,7 @@ import pytest
 from helpers.agreement import random_views
 from helpers.cones import BOX_FACES, box_vertices
 from helpers.hulls import projection, ring_views, sphere_mesh
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -100,7 +101,7 @@ def test_triangles_without_area_are_told_too() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(1, 6), keep=st.booleans())
-@settings(max_examples=60)
+@settings(max_examples=asked(60))
 def test_what_is_told_of_triangles_holds_at_their_points(
     seed: int, n_cameras: int, keep: bool
 ) -> None:

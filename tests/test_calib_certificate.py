@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.boards import board_poses, look_at, observe_exactly, project, ring
 from helpers.records import make_record
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,7 +42,7 @@ def certified(rig: Rig) -> Certificate:
     return certify(rig, make_record([one.name for one in rig.cameras]), {}, working_volume(rig))
 
 
-@settings(max_examples=16)
+@settings(max_examples=asked(16))
 @given(
     index=st.integers(0, 7),
     factor=st.floats(0.05, 20.0),

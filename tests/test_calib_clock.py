@@ -200,6 +200,7 @@ def test_a_symmetric_board_tells_them_too() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_order_of_cameras_changes_no_bit() -> None:
     recording = out_of_time(LATE, 40, noise_px=0.2)
     late = CalibrationSettings(sync="estimate")

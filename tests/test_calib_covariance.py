@@ -268,6 +268,7 @@ def test_a_point_that_one_camera_sees_has_no_place() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_world_found_by_the_cameras_shares_their_errors() -> None:
     """Points whose places are known define the world: errors of poses in it, over many seeds."""
     true = ring(BOARD, ["PINHOLE"] * 3)

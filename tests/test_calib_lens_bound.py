@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.boards import LENSES, look_at, make_camera
 from helpers.sessions import FOCAL_PX, SIZE_PX, write_ball_session, write_cube_scene
+from helpers.thorough import asked, some_of
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -237,7 +238,7 @@ def test_a_box_of_rays_bounds_every_ray_in_it(camera: Camera, seed: int) -> None
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 @given(camera=cameras(), seed=st.integers(0, 2**32 - 1))
 def test_no_point_is_answered_from_farther_than_promised(camera: Camera, seed: int) -> None:
     shift_px, largest_px = bound_and_largest(camera, seed)
@@ -247,7 +248,7 @@ def test_no_point_is_answered_from_farther_than_promised(camera: Camera, seed: i
 
 @pytest.mark.parametrize("squeeze", [0.7, 1.4])
 @pytest.mark.parametrize("strength", [-1.2, 1.2])
-@pytest.mark.parametrize("model", BENT)
+@pytest.mark.parametrize("model", some_of(BENT))
 def test_the_bound_is_near_the_largest_shift_of_every_model(
     model: str, strength: float, squeeze: float
 ) -> None:
@@ -283,7 +284,7 @@ def bound_and_largest(camera: Camera, seed: int) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 @given(camera=cameras(), grain_px=st.sampled_from([1, 2, 5, 30]), seed=st.integers(0, 2**32 - 1))
 @example(camera=make_camera("cam", "OPENCV", POSE), grain_px=3, seed=0)
 def test_answers_differ_only_near_pixels_of_the_other_value(

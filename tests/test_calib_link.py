@@ -13,6 +13,7 @@ from helpers.recorded_boards import (
     reordered,
     row_of_cameras,
 )
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -85,7 +86,7 @@ def test_a_chain_of_cameras_that_see_a_board_with_the_next_only() -> None:
     assert not linked.warnings
 
 
-@settings(max_examples=10)
+@settings(max_examples=asked(10))
 @given(seed=st.integers(0, 1000))
 def test_the_order_of_views_changes_no_bit(seed: int) -> None:
     """That of cameras and boards is set before (`solve_rig`)."""
@@ -272,7 +273,7 @@ def test_boards_of_one_body_never_seen_together_are_named() -> None:
         link(recording)
 
 
-@settings(max_examples=20)
+@settings(max_examples=asked(20))
 @given(seed=st.integers(0, 10_000))
 def test_two_unknown_poses_are_found_together(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -305,7 +306,7 @@ def test_a_body_turned_about_one_axis_tells_too_little() -> None:
 # --- Symmetric boards ------------------------------------------------------------------------
 
 
-@settings(max_examples=8)
+@settings(max_examples=asked(8))
 @given(seed=st.integers(0, 1000))
 def test_frames_tell_which_way_round_a_symmetric_board_was_seen(seed: int) -> None:
     turns = np.random.default_rng(seed).integers(0, 2, (3, 200))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.boards import look_at, make_camera, ring
 from helpers.recorded_boards import random_pose
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -91,7 +92,7 @@ def assert_same(placed: Placed, world_from_rig: Pose) -> None:
     assert json.loads(json.dumps(told)) == told
 
 
-@settings(max_examples=15)
+@settings(max_examples=asked(15))
 @given(seed=st.integers(0, 1000))
 def test_all_ways_find_the_same_world(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from helpers.thorough import asked
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from hybridve.calib.errors import SessionError
 from hybridve.hull.capture.background import SAMPLE_FRAMES, learn_background
 
-_FEW = settings(max_examples=20)
+_FEW = settings(max_examples=asked(20))
 
 #: How far a mean of 20 or more values with noise of 3 is off at most, 1 sigma in grey levels: where
 #: few values are near the middle one, the others do not count, and it is as rough as a median.

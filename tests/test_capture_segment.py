@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from hybridve.calib.image_io import FrameSource, open_source, read_image
 from hybridve.hull.capture.background import Background, learn_background
 from hybridve.hull.capture.segment import Segmenter, SegmentSettings, clean
 
-_FEW = settings(max_examples=20)
+_FEW = settings(max_examples=asked(20))
 
 WIDTH, HEIGHT = 160, 120
 NOISE = 2.0  # grey levels
@@ -383,7 +384,7 @@ def cleaned_by_opencv(mask: Bytes, speck_px: int, hole_px: int) -> Bytes:
     return result
 
 
-@settings(max_examples=200)
+@settings(max_examples=asked(200))
 @given(
     seed=seeds,
     width=st.integers(1, 40),

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.segmentation import OUTRIGHT_LEVELS, evidence_reference
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ def smooth(rng: np.random.Generator, sigma_px: float) -> NDArray[np.float64]:
     return np.asarray(layer / layer.std())
 
 
-@settings(max_examples=30)
+@settings(max_examples=asked(30))
 @given(
     seed=st.integers(0, 2**32 - 1),
     gain=st.floats(0.9, 1.1),

@@ -5,6 +5,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.thorough import asked
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from hybridve.calib.errors import ReportError
 from hybridve.hull.capture.silhouette_io import SilhouetteReader, SilhouetteWriter
 
 _FEW = settings(
-    max_examples=25,
+    max_examples=asked(25),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.cones import hull_of_balls, views_from
 from helpers.hulls import MASK_KINDS, UNSEEN, ball_hull, random_masks, random_views, ring_views
+from helpers.thorough import asked
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -185,7 +186,7 @@ def hulls(draw: st.DrawFn) -> Hull:
     return make_hull(views, random_masks(rng, views, rng.choice(MASK_KINDS, n_cameras).tolist()))
 
 
-@settings(max_examples=25)
+@settings(max_examples=asked(25))
 @given(hull=hulls(), seed=st.integers(0, 2**32 - 1))
 def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
     hull: Hull, seed: int
@@ -209,7 +210,7 @@ def test_every_point_of_a_hull_is_in_a_volume_and_what_is_connected_in_one(
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 @given(seed=st.integers(0, 2**32 - 1), n_cameras=st.integers(2, 5), n_balls=st.integers(1, 4))
 @example(seed=242, n_cameras=2, n_balls=1)
 def test_what_is_called_real_holds_a_part_of_a_real_ball(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.contacts import FREE
 from helpers.plates import balls, found_in, looking_down, plate
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -76,7 +77,7 @@ def test_what_is_nearer_than_required_is_a_patch_with_bounds_of_its_own(
 
 
 @pytest.mark.slow
-@settings(max_examples=12)
+@settings(max_examples=asked(12))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_patches_share_out_the_points_and_the_nearest_of_them_is_the_clearance(seed: int) -> None:
     rng = np.random.default_rng(seed)

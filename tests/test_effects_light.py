@@ -9,6 +9,7 @@ import pytest
 from helpers.effects import CUBE, cube, empty_hull, entry_of, floor, held, setting_of
 from helpers.hulls import ball_hull, look_at, projection, ring_views
 from helpers.response import box_vertices, polyhedron_masks
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -256,7 +257,7 @@ def test_a_ball_of_a_lamp_is_as_bright_as_a_point_and_its_shadow_is_soft() -> No
     more_m=st.floats(0.0, 0.2),
     lamp_mm=st.tuples(*[st.floats(-800.0, 800.0)] * 2, st.floats(-100.0, 1500.0)),
 )
-@settings(max_examples=8)
+@settings(max_examples=asked(8))
 def test_a_larger_hull_never_lights_more(
     center: tuple[float, ...],
     radius_m: float,

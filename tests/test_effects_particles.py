@@ -9,6 +9,7 @@ import pytest
 from helpers.effects import cube, empty_hull, entry_of, floor, held, scene_object, setting_of
 from helpers.hulls import ball_hull, look_at, projection, ring_views
 from helpers.response import ball_exits, box_vertices, polyhedron_masks
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -517,7 +518,7 @@ def test_columns_are_as_told() -> None:
     restitution=st.floats(0.0, 1.0),
     step_s=st.floats(1e-4, 0.1),
 )
-@settings(max_examples=12)
+@settings(max_examples=asked(12))
 def test_whatever_the_hull_does_none_is_in_it_and_all_are_numbers(
     center: tuple[float, ...],
     moved: tuple[float, ...],

@@ -17,6 +17,7 @@ from helpers.hulls import (
     ring_views,
     soup,
 )
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,7 +37,7 @@ def hulls(draw: st.DrawFn) -> Hull:
     return make_hull(views, random_masks(rng, views, kinds))
 
 
-@settings(max_examples=150)
+@settings(max_examples=asked(150))
 @given(hull=hulls(), seed=st.integers(0, 2**32 - 1))
 def test_a_verdict_holds_for_every_sample(hull: Hull, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -51,7 +52,7 @@ def test_a_verdict_holds_for_every_sample(hull: Hull, seed: int) -> None:
     assert (n_inside[verdict == FULL] == 210).all()
 
 
-@settings(max_examples=150)
+@settings(max_examples=asked(150))
 @given(
     hull=hulls(), seed=st.integers(0, 2**32 - 1), reach_m=st.sampled_from([0.01, 0.1, 1.0, 10.0])
 )

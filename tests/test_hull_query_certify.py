@@ -19,6 +19,7 @@ from helpers.hulls import (
     soup,
     sphere_mesh,
 )
+from helpers.thorough import asked
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -87,7 +88,7 @@ def test_verdicts_are_those_of_the_specification(
 
 
 @pytest.mark.slow
-@settings(examples, max_examples=30)
+@settings(examples, max_examples=asked(30))
 @given(scene=scenes())
 def test_what_is_free_has_no_hit_at_any_viewport(
     certifier: Certifier, scene: tuple[Hull, Triangles]

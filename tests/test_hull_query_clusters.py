@@ -17,6 +17,7 @@ from helpers.hulls import (
     soup,
     sphere_mesh,
 )
+from helpers.thorough import asked
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -46,7 +47,7 @@ def again(hull: Hull) -> Hull:
 @pytest.mark.slow
 @pytest.mark.usefixtures("_deep_trees")
 @settings(
-    max_examples=60,
+    max_examples=asked(60),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.contacts import FREE, crumpled_body, free_contact, points_of, some_hits, stored_mesh
+from helpers.thorough import asked
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ from hybridve.hull.report.write import ReportWriter
 
 # The settings of HDF5 do not matter here; small parts make the joins between them happen.
 _FEW = settings(
-    max_examples=15,
+    max_examples=asked(15),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.clash_reports import Spot, write_clash_report
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -197,7 +198,7 @@ entries = st.builds(
 
 
 @pytest.mark.slow
-@settings(max_examples=30)
+@settings(max_examples=asked(30))
 @given(
     entries=st.lists(entries, max_size=4, unique_by=lambda one: one.id),
     runs=st.dictionaries(TEXTS, st.text("0:T-")),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.boards import LENSES, look_at, make_camera, ring
 from helpers.records import make_opinion, make_record
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgba_array
@@ -357,7 +358,7 @@ def words_of(value: Any) -> list[str]:
     return [value] if isinstance(value, str) else []
 
 
-@settings(max_examples=60)
+@settings(max_examples=asked(60))
 @given(value=PLAIN)
 def test_every_word_of_the_details_is_there_however_nested(value: Any) -> None:
     page = shown(value)

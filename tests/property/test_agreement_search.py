@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from helpers.agreement import balls, random_views, shifted
 from helpers.hulls import with_gaps
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ def points_on_rays(
 
 
 @given(seed=seeds, n_cameras=st.integers(1, 6))
-@settings(max_examples=150)
+@settings(max_examples=asked(150))
 def test_what_is_proved_empty_holds_no_point_and_what_is_found_is_one(
     seed: int, n_cameras: int
 ) -> None:
@@ -110,7 +111,7 @@ def test_what_is_proved_empty_holds_no_point_and_what_is_found_is_one(
     unseen=st.sampled_from(["carve", "keep", "gaps"]),
     data=st.data(),
 )
-@settings(max_examples=100)
+@settings(max_examples=asked(100))
 def test_a_hull_is_proved_empty_only_if_it_is(
     seed: int, n_cameras: int, unseen: str, data: st.DataObject
 ) -> None:
@@ -132,7 +133,7 @@ def test_a_hull_is_proved_empty_only_if_it_is(
 
 
 @given(seed=seeds, n_cameras=st.integers(2, 5), grown_px=st.integers(0, 6))
-@settings(max_examples=60)
+@settings(max_examples=asked(60))
 def test_growing_silhouettes_as_images_is_the_same(
     seed: int, n_cameras: int, grown_px: int
 ) -> None:

@@ -11,6 +11,7 @@ from helpers.exact_geometry import (
     side_of_plane,
     squared_to_triangle,
 )
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ _POINTS = st.tuples(_COORDINATES, _COORDINATES, _COORDINATES).map(np.array)
 
 
 @given(_POINTS, _POINTS, _POINTS, _POINTS, st.sampled_from([0.0, 0.25, 0.5, 1.0]))
-@settings(max_examples=400)
+@settings(max_examples=asked(400))
 def test_sides_are_those_of_rational_arithmetic(
     a: NDArray[np.float64],
     b: NDArray[np.float64],
@@ -55,7 +56,7 @@ def test_sides_are_those_of_rational_arithmetic(
 
 
 @given(st.lists(st.floats(-1e300, 1e300), max_size=30), st.randoms())
-@settings(max_examples=300)
+@settings(max_examples=asked(300))
 def test_a_sum_has_the_sign_of_the_exact_sum(terms: list[float], random: object) -> None:
     """Of numbers that cancel, too: each stands there with its opposite, but for some."""
     from fractions import Fraction
@@ -94,7 +95,7 @@ def assert_exact(surface: SurfaceDistance, corners: NDArray[np.float64], points:
 
 @pytest.mark.slow
 @given(_POINTS, _POINTS, _POINTS, st.lists(_POINTS, min_size=1, max_size=3))
-@settings(max_examples=300)
+@settings(max_examples=asked(300))
 def test_distances_to_any_triangle_are_exact_but_for_rounding(
     a: NDArray[np.float64],
     b: NDArray[np.float64],

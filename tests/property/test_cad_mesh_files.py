@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.mesh_files import WRITERS, dae, fbx_text, polylist_dae, text_fbx
 from helpers.step_files import step_box, step_file
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -122,7 +123,7 @@ def measured(cad: CadFile) -> tuple[int, float, float | None]:
 
 @pytest.mark.parametrize("name", WRITERS)
 @given(solid=prisms())
-@settings(max_examples=25)
+@settings(max_examples=asked(25))
 def test_a_solid_comes_back_whole_from_every_kind_of_file(
     folder: Path, name: str, solid: Solid
 ) -> None:
@@ -154,7 +155,7 @@ FACES = [
 
 @pytest.mark.parametrize("name", [name for name in WRITERS if not name.endswith(".obj")])
 @given(data=st.data())
-@settings(max_examples=100)
+@settings(max_examples=asked(100))
 def test_a_file_cut_off_reads_the_same_or_is_refused(
     folder: Path, name: str, data: st.DataObject
 ) -> None:
@@ -175,7 +176,7 @@ def test_a_file_cut_off_reads_the_same_or_is_refused(
 
 @pytest.mark.parametrize("name", ["plain.obj", "relative.obj"])
 @given(data=st.data())
-@settings(max_examples=150)
+@settings(max_examples=asked(150))
 def test_an_obj_cut_off_is_refused_or_said_to_be_open(
     folder: Path, name: str, data: st.DataObject
 ) -> None:
@@ -200,7 +201,7 @@ def test_an_obj_cut_off_is_refused_or_said_to_be_open(
 
 @pytest.mark.slow
 @given(data=st.data())
-@settings(max_examples=8)
+@settings(max_examples=asked(8))
 def test_a_step_file_cut_off_reads_the_same_or_is_refused(
     folder: Path, data: st.DataObject
 ) -> None:
@@ -218,7 +219,7 @@ def test_a_step_file_cut_off_reads_the_same_or_is_refused(
 
 
 @given(data=st.data(), name=st.sampled_from(sorted(WRITERS)))
-@settings(max_examples=300)
+@settings(max_examples=asked(300))
 def test_bytes_that_change_never_crash_a_reader(
     folder: Path, data: st.DataObject, name: str
 ) -> None:
@@ -304,7 +305,7 @@ def fbx_properties(draw: st.DrawFn, *, even: bool) -> str:
 
 
 @given(inner=fbx_properties(even=False), outer=fbx_properties(even=True))
-@settings(max_examples=30)
+@settings(max_examples=asked(30))
 def test_assimp_places_fbx_models_where_we_do(folder: Path, inner: str, outer: str) -> None:
     """Open3D reads triangles through assimp, in single precision, and y up."""
     import open3d

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.boards import LENSES
 from helpers.hulls import look_at, projection
+from helpers.thorough import asked
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -76,7 +77,7 @@ def img_from_world(camera: Camera) -> NDArray[np.float64]:
         st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.5, 50)), min_size=1, max_size=5
     ),
 )
-@settings(max_examples=150)
+@settings(max_examples=asked(150))
 def test_a_projection_matrix_is_decomposed_without_loss(
     camera: Camera,
     log_factor: float,
@@ -114,7 +115,7 @@ def test_a_projection_matrix_is_decomposed_without_loss(
         max_size=6,
     )
 )
-@settings(max_examples=150)
+@settings(max_examples=asked(150))
 def test_mirrored_pictures_are_refused_and_reversed_signs_are_not(
     parts: list[tuple[float, float, bool, float, bool]],
 ) -> None:
@@ -211,7 +212,7 @@ def seeing_cameras(draw: st.DrawFn, models: tuple[str, ...]) -> Rig:
 
 @pytest.mark.parametrize("to", FORMATS)
 @given(data=st.data())
-@settings(max_examples=20)
+@settings(max_examples=asked(20))
 def test_every_format_gives_back_the_images_of_every_lens_that_it_holds(
     to: str, data: st.DataObject
 ) -> None:
@@ -265,7 +266,7 @@ def test_a_rotation_vector_turns_as_the_rotation_does_at_every_angle(
 
 
 @given(data=st.data(), n_cameras=st.integers(1, 4))
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 def test_cameras_are_taken_from_a_rig_with_their_share_of_the_covariance(
     data: st.DataObject, n_cameras: int
 ) -> None:

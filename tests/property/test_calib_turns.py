@@ -3,6 +3,7 @@
 from collections import Counter
 
 import pytest
+from helpers.thorough import asked
 from helpers.turned_rigs import BOARDS, around, turned
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,7 @@ from hybridve.calib.judging.check import check_rig
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@settings(max_examples=asked(10))
 @given(
     board=st.sampled_from(BOARDS),
     looks=st.lists(st.integers(0, 3), min_size=2, max_size=4),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.rooms import bent_lens, exposed, see_wall, true_shift_px, wall, with_blob
+from helpers.thorough import asked
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ seeds = st.integers(0, 2**31)
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=asked(25))
 @given(seed=seeds, turn=turns | small_turns, zoom=st.floats(0.97, 1.03), noise=noises)
 def test_a_turned_camera_is_found_within_its_stated_error(
     seed: int, turn: NDArray[np.float64], zoom: float, noise: float
@@ -60,7 +61,7 @@ def test_a_turned_camera_is_found_within_its_stated_error(
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=asked(25))
 @given(seed=seeds, noise=noises, blank=st.sampled_from([0.0, 0.0, 0.8, 0.9, 0.95, 1.0]))
 def test_a_camera_that_stands_is_never_told_to_have_moved(
     seed: int, noise: float, blank: float
@@ -72,7 +73,7 @@ def test_a_camera_that_stands_is_never_told_to_have_moved(
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=asked(25))
 @given(seed=seeds, turn=turns, noise=noises, blank=st.sampled_from([0.8, 0.9, 0.95]))
 def test_in_a_bare_room_what_is_said_of_a_turned_camera_is_true(
     seed: int, turn: NDArray[np.float64], noise: float, blank: float
@@ -89,7 +90,7 @@ def test_in_a_bare_room_what_is_said_of_a_turned_camera_is_true(
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@settings(max_examples=asked(10))
 @given(seed=seeds, turn=turns, noise=noises)
 def test_a_blank_room_tells_nothing(seed: int, turn: NDArray[np.float64], noise: float) -> None:
     rng = np.random.default_rng(seed)
@@ -104,7 +105,7 @@ def test_a_blank_room_tells_nothing(seed: int, turn: NDArray[np.float64], noise:
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@settings(max_examples=asked(10))
 @given(first=st.integers(0, 3), more=st.integers(1, 3), noise=noises)
 def test_two_different_rooms_tell_nothing(first: int, more: int, noise: float) -> None:
     rng = np.random.default_rng(first)

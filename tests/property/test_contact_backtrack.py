@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.hulls import ball_angles, ball_hull, pixels_of, ring_views
+from helpers.thorough import asked
 from hypothesis import Phase, assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -204,7 +205,7 @@ def touching_fraction(
 
 # Not shrunk: an example takes a tenth of a second.
 @pytest.mark.slow
-@settings(max_examples=30, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+@settings(max_examples=asked(30), phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(
     radius_m=st.floats(0.04, 0.1),
     widths=st.floats(0.1, 3.0),

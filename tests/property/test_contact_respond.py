@@ -5,6 +5,7 @@ import pytest
 from helpers.contacts import contact_at
 from helpers.hulls import MASK_KINDS, UNSEEN, random_masks, random_views
 from helpers.response import camera_center, random_unit
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -47,7 +48,7 @@ def rays(draw: st.DrawFn) -> Ray:
     return hull, start, unit, rng
 
 
-@settings(max_examples=400)
+@settings(max_examples=asked(400))
 @given(ray=rays(), reach_m=st.sampled_from([0.05, 0.5, 4.0, 20.0]))
 def test_points_are_in_the_hull_where_the_ray_is(ray: Ray, reach_m: float) -> None:
     hull, start, unit, rng = ray
@@ -67,7 +68,7 @@ def test_points_are_in_the_hull_where_the_ray_is(ray: Ray, reach_m: float) -> No
     np.testing.assert_array_equal(in_span[~near], expected[~near])
 
 
-@settings(max_examples=200)
+@settings(max_examples=asked(200))
 @given(ray=rays())
 def test_a_stretch_ends_at_a_camera_and_begins_at_one(ray: Ray) -> None:
     hull, start, unit, _ = ray
@@ -82,7 +83,7 @@ def test_a_stretch_ends_at_a_camera_and_begins_at_one(ray: Ray) -> None:
         assert not boundary_cameras(hull, start + (first_m + last_m) / 2 * unit, unit)
 
 
-@settings(max_examples=200)
+@settings(max_examples=asked(200))
 @given(ray=rays())
 def test_few_points_are_asked_as_many_are(ray: Ray) -> None:
     hull, start, unit, rng = ray
@@ -120,7 +121,7 @@ def collisions(draw: st.DrawFn) -> tuple[Hull, NDArray[np.float64], Response, Re
 
 
 @pytest.mark.slow
-@settings(max_examples=400)
+@settings(max_examples=asked(400))
 @given(collision=collisions())
 def test_what_is_known_is_consistent_and_what_is_not_is_nan(
     collision: tuple[Hull, NDArray[np.float64], Response, ResponseSettings],
@@ -159,7 +160,7 @@ def test_what_is_known_is_consistent_and_what_is_not_is_nan(
 
 
 @pytest.mark.slow
-@settings(max_examples=400)
+@settings(max_examples=asked(400))
 @given(collision=collisions())
 def test_the_paper_s_distance_is_within_a_step_of_the_exact_one(
     collision: tuple[Hull, NDArray[np.float64], Response, ResponseSettings],
@@ -175,7 +176,7 @@ def test_the_paper_s_distance_is_within_a_step_of_the_exact_one(
         assert answer.status_paper == "outside" or answer.d_rec_paper_m == 0
 
 
-@settings(max_examples=150)
+@settings(max_examples=asked(150))
 @given(collision=collisions())
 def test_the_exact_distance_is_what_dense_sampling_from_the_base_finds(
     collision: tuple[Hull, NDArray[np.float64], Response, ResponseSettings],

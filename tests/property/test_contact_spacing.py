@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.hulls import MASK_KINDS, random_masks, random_views
 from helpers.polytopes import depth_in_box, distance_between, rectangle_hull
+from helpers.thorough import some_of
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -76,7 +77,7 @@ def random_hull(rng: np.random.Generator) -> Hull:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", some_of(range(6)))
 def test_every_shift_is_what_measuring_there_says(seed: int) -> None:
     """Blobs, holes, half images; closed objects and open ones."""
     rng = np.random.default_rng([8, seed])
@@ -113,7 +114,7 @@ def test_every_shift_is_what_measuring_there_says(seed: int) -> None:
     assert min(n_violated, n_free) > 0
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", some_of(range(10)))
 def test_every_shift_is_what_exact_distances_of_convex_hulls_say(seed: int) -> None:
     rng = np.random.default_rng([9, seed])
     n_violated = n_free = 0
@@ -150,7 +151,7 @@ def test_every_shift_is_what_exact_distances_of_convex_hulls_say(seed: int) -> N
                 assert abs(upper - depth - clearance_m) < move.tolerance_m / 2
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", some_of(range(5)))
 def test_a_larger_clearance_never_needs_less_and_a_group_needs_what_its_parts_need(
     seed: int,
 ) -> None:

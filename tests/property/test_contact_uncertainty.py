@@ -13,6 +13,7 @@ from helpers.hulls import (
     random_masks,
     random_views,
 )
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -51,7 +52,7 @@ def hull_beside_box(seed: int, n_cameras: int, n_balls: int) -> tuple[Hull, floa
 
 
 @pytest.mark.slow
-@settings(max_examples=200)
+@settings(max_examples=asked(200))
 @given(seed=seeds, n_cameras=st.integers(2, 5), n_balls=st.integers(1, 3))
 def test_the_real_thing_is_not_farther_away_than_the_bound(
     seed: int, n_cameras: int, n_balls: int
@@ -66,7 +67,7 @@ def test_the_real_thing_is_not_farther_away_than_the_bound(
     assert np.isfinite(bound_m)
 
 
-@settings(max_examples=50)
+@settings(max_examples=asked(50))
 @given(seed=seeds)
 def test_the_farthest_point_of_a_ray_is_bounded_closely(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -83,7 +84,7 @@ def test_the_farthest_point_of_a_ray_is_bounded_closely(seed: int) -> None:
     assert farthest_on(meter(), ray, farthest_m - 0.01) in (bound_m, np.inf)
 
 
-@settings(max_examples=10)
+@settings(max_examples=asked(10))
 @given(seed=seeds, n_cameras=st.integers(2, 5), n_balls=st.integers(1, 3))
 def test_a_doubt_does_not_depend_on_what_was_doubted_before(
     seed: int, n_cameras: int, n_balls: int
@@ -105,7 +106,7 @@ def test_a_doubt_does_not_depend_on_what_was_doubted_before(
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name), err_msg=name)
 
 
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 @given(seed=seeds, n_cameras=st.integers(1, 5), unseen=st.sampled_from(["carve", "keep"]))
 def test_whatever_the_silhouettes_a_doubt_agrees_with_itself(
     seed: int, n_cameras: int, unseen: Unseen

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.effect_cloth import deepest_m, drive, make_cloth, sheet, views_around
 from helpers.response import ball_silhouettes
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +14,7 @@ VIEWS = views_around()
 
 
 @pytest.mark.slow
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=asked(10), deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     recovery=st.sampled_from(["direction", "nearest"]),

@@ -20,6 +20,7 @@ from helpers.hulls import (
     random_views,
     soup,
 )
+from helpers.thorough import asked
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -31,7 +32,7 @@ from hybridve.hull.query.silhouettes import Hull, Unseen, Views, make_hull
 from hybridve.hull.query.stencil import Stencil
 
 examples = settings(
-    max_examples=150,
+    max_examples=asked(150),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 

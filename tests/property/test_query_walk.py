@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.hulls import EMPTYING_MASK_KINDS, MASK_KINDS, UNSEEN, random_masks, random_views
 from helpers.response import camera_center, random_unit
+from helpers.thorough import asked
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ def rays(draw: st.DrawFn) -> Rays:
 
 
 @pytest.mark.slow
-@settings(max_examples=300)
+@settings(max_examples=asked(300))
 @given(rays=rays(), reach_m=st.sampled_from([0.05, 4.0, 1e3, 1e7]))
 def test_the_compiled_walk_is_the_specification(rays: Rays, reach_m: float) -> None:
     hull, starts, units = rays
@@ -54,7 +55,7 @@ def test_the_compiled_walk_is_the_specification(rays: Rays, reach_m: float) -> N
         np.testing.assert_allclose(found_m, expected_m, rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=50)
+@settings(max_examples=asked(50))
 @given(rays=rays(), seed=st.integers(0, 99))
 def test_a_ray_is_walked_alike_among_others(rays: Rays, seed: int) -> None:
     hull, starts, units = rays
@@ -72,7 +73,7 @@ def test_a_ray_is_walked_alike_among_others(rays: Rays, seed: int) -> None:
 PLACES = ((1e-6, 0.0), (1e3, 0.0), (1e6, 0.0), (1e9, 0.0), (1.0, 1e4), (1.0, 5e6))
 
 
-@settings(max_examples=60)
+@settings(max_examples=asked(60))
 @given(seed=st.integers(0, 2**32 - 1), place=st.sampled_from(PLACES))
 @example(seed=29301, place=(1.0, 1e4))  # a corner that the projection passes slowly
 @example(seed=29301, place=(1e-6, 0.0))

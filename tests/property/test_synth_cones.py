@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.thorough import asked
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -153,7 +154,7 @@ def test_cells_that_hold_a_camera_hide_nothing_of_the_hull() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@settings(max_examples=asked(60))
 @given(place=places, radius_m=sizes, offset=offsets, camera=st.integers(0, 3))
 def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
     place: NDArray[np.float64], radius_m: float, offset: NDArray[np.float64], camera: int
@@ -177,7 +178,7 @@ def test_a_speck_is_as_far_from_the_cone_of_one_camera_as_geometry_says(
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=asked(25))
 @given(
     place=places,
     sizes_m=st.tuples(sizes, sizes, sizes),

@@ -6,6 +6,7 @@ from math import isqrt
 
 import numpy as np
 import pytest
+from helpers.thorough import asked
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -276,7 +277,7 @@ def test_a_ray_without_a_direction_meets_nothing(shape: Shape) -> None:
     first=(Ball(0.25), np.eye(3, 4)),
     second=(Ball(0.25), np.column_stack([rotation_about_axes((0.0, 0.0, 1.125)), np.zeros(3)])),
 )
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 @given(
     corners=st.lists(points, min_size=3, max_size=9),
     first=st.tuples(shapes, poses),

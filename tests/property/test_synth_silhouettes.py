@@ -5,6 +5,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,7 +29,7 @@ def view(camera: int) -> View:
     return make_view(PRESETS["boxes"].make_stage().cameras[camera])
 
 
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 @given(camera=st.integers(0, 3), place=places, radius_m=sizes)
 def test_silhouette_of_a_ball_is_its_tangent_cone(
     camera: int, place: tuple[float, float, float], radius_m: float
@@ -63,7 +64,7 @@ def test_silhouette_of_a_ball_is_its_tangent_cone(
             assert bool(silhouette[row, column]) == (inside_px > 0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=asked(40))
 @given(
     camera=st.integers(0, 3),
     place=places,
