@@ -8,6 +8,7 @@
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
 # make hard-cases   the table of hard cases in tests/README.md: what each column makes of each row
 # make lock    renew requirements.lock after a change of pyproject.toml
+# make vendor  build what pages bring along (three.js) anew, after a change in .ci/vendor; needs npm
 
 BIN := .venv/bin
 
@@ -18,7 +19,7 @@ pytest quick coverage oldest soak bench theory hard-cases: export OPENBLAS_NUM_T
 # each command that a test starts its share.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check pytest quick coverage oldest soak bench theory hard-cases lock setup clean
+.PHONY: demo test check pytest quick coverage oldest soak bench theory hard-cases lock vendor setup clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -67,6 +68,9 @@ lock: setup
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-header \
 		--python-version 3.11 --quiet -o requirements.lock
+
+vendor:
+	@bash .ci/vendor/build
 
 setup:
 	@bash .ci/setup
