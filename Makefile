@@ -19,7 +19,7 @@ pytest quick coverage oldest soak bench theory hard-cases: export OPENBLAS_NUM_T
 # each command that a test starts its share.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check pytest quick coverage oldest soak bench theory hard-cases lock vendor setup clean
+.PHONY: demo test check pytest quick coverage oldest soak bench theory hard-cases lock vendor setup browser clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -35,13 +35,13 @@ check: setup
 
 # Files of tests side by side; one file stays with one process, so that fixtures are made once.
 # Property tests are asked the same examples in every run, on every machine.
-pytest: setup
+pytest: setup browser
 	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable
 
 quick: setup
 	$(BIN)/pytest -q -n auto --dist loadfile --benchmark-disable --quick
 
-coverage: setup
+coverage: setup browser
 	$(BIN)/pytest -q -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable \
 		--cov --cov-report=term
 	@printf 'coverage: %s %% of the lines\n' "$$($(BIN)/coverage report --format=total)"
@@ -74,6 +74,10 @@ vendor:
 
 setup:
 	@bash .ci/setup
+
+# Tests open pages in it; nothing else needs it.
+browser:
+	@bash .ci/browser
 
 clean:
 	rm -rf .venv build demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -103,7 +103,7 @@ def clashes(
     ledger = decided(ledger, wanted)
     listed = tuple(one.by(ledger) for one in listed)
     if ledger != before:
-        _keep(ledger, write_ledger, must_be=bool(wanted))
+        keep_ledger(ledger, write_ledger, must_be=bool(wanted))
     gone = _gone(before, ledger)
     if as_json:
         click.echo(json.dumps(_told(loaded, ledger, found, listed, gone)))
@@ -148,7 +148,7 @@ def _user() -> str:
         return ""
 
 
-def _keep(ledger: "Ledger", write: Any, *, must_be: bool) -> None:
+def keep_ledger(ledger: "Ledger", write: Any, *, must_be: bool) -> None:
     """Write the ledger; where only a look was taken, and it cannot be, say so and go on."""
     from hybridve.calib.errors import ReportError
 
