@@ -9,6 +9,7 @@
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
 # make hard-cases   the table of hard cases in tests/README.md: what each column makes of each row
 # make lock    renew requirements.lock after a change of pyproject.toml
+# make vendor  build what pages bring along (three.js) anew, after a change in .ci/vendor; needs npm
 
 BIN := .venv/bin
 
@@ -19,7 +20,8 @@ pytest thorough quick coverage oldest soak bench theory hard-cases: export OPENB
 # each command that a test starts its share.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check pytest thorough quick coverage oldest soak bench theory hard-cases lock setup clean
+.PHONY: demo test check pytest thorough quick coverage oldest soak bench theory hard-cases lock vendor setup \
+	browser clean
 
 demo: setup
 	$(BIN)/hybridve demo -o demo --overwrite
@@ -35,18 +37,18 @@ check: setup
 
 # Files of tests side by side; one file stays with one process, so that fixtures are made once.
 # Property tests are asked the same examples in every run, on every machine.
-pytest: setup
+pytest: setup browser
 	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable
 
 thorough coverage soak: export HYBRIDVE_TESTS = thorough
 
-thorough: setup
+thorough: setup browser
 	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable
 
 quick: setup
 	$(BIN)/pytest -q -n auto --dist loadfile --benchmark-disable --quick
 
-coverage: setup
+coverage: setup browser
 	$(BIN)/pytest -q -n auto --dist loadfile --no-loadscope-reorder --benchmark-disable \
 		--cov --cov-report=term
 	@printf 'coverage: %s %% of the lines\n' "$$($(BIN)/coverage report --format=total)"
@@ -74,8 +76,15 @@ lock: setup
 	$(BIN)/uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-header \
 		--python-version 3.11 --quiet -o requirements.lock
 
+vendor:
+	@bash .ci/vendor/build
+
 setup:
 	@bash .ci/setup
+
+# Tests open pages in it; nothing else needs it.
+browser:
+	@bash .ci/browser
 
 clean:
 	rm -rf .venv build demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

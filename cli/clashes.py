@@ -9,11 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridve.calib.lengths import at_least_mm, bounds_mm, mm
 from hybridve.cli import options
+from hybridve.hull.report.wording import (
+    at_95_text,
+    counted_clashes,
+    sentence,
+    worst_text,
+)
 
 if TYPE_CHECKING:
-    from hybridve.hull.report.clashes import Clash, Clashes
+    from hybridve.hull.report.clashes import Clashes
     from hybridve.hull.report.ledger import Decision, Ledger, Listed
     from hybridve.hull.report.read import Report
 
@@ -98,7 +103,7 @@ def clashes(
     ledger = decided(ledger, wanted)
     listed = tuple(one.by(ledger) for one in listed)
     if ledger != before:
-        _keep(ledger, write_ledger, must_be=bool(wanted))
+        keep_ledger(ledger, write_ledger, must_be=bool(wanted))
     gone = _gone(before, ledger)
     if as_json:
         click.echo(json.dumps(_told(loaded, ledger, found, listed, gone)))
@@ -143,7 +148,7 @@ def _user() -> str:
         return ""
 
 
-def _keep(ledger: "Ledger", write: Any, *, must_be: bool) -> None:
+def keep_ledger(ledger: "Ledger", write: Any, *, must_be: bool) -> None:
     """Write the ledger; where only a look was taken, and it cannot be, say so and go on."""
     from hybridve.calib.errors import ReportError
 
@@ -242,11 +247,6 @@ def _print(
     click.echo(f"  ids and decisions: {ledger.path}")
 
 
-def counted_clashes(count: int) -> str:
-    """Return "1 clash", "2 clashes"."""
-    return "1 clash" if count == 1 else f"{count} clashes"
-
-
 def _first_line(report: "Report", listed: "tuple[Listed, ...]") -> str:
     """Return the answer in one sentence."""
     if not listed:
@@ -262,48 +262,6 @@ def _first_line(report: "Report", listed: "tuple[Listed, ...]") -> str:
     if not report.agreement.is_trusted:
         return f"not to be trusted, the cameras contradict each other: {answer}"
     return answer
-
-
-def sentence(clash: "Clash") -> str:
-    """Return in words what a clash is, where to look, and how sure it is."""
-    lower_m, upper_m = clash.worst.clearance_m
-    if clash.kind == "too near":
-        what = (
-            f"something real comes within {bounds_mm(lower_m, upper_m)} mm of {clash.name}, "
-            f"where {mm(clash.required_m, 'g')} mm are required"
-        )
-    elif upper_m < 0.0 or clash.kind == "inside":
-        into = "is wholly inside" if clash.kind == "inside" else "reaches into"
-        what = f"something real {into} {clash.name}, {bounds_mm(-upper_m, -lower_m)} mm deep"
-    else:
-        what = f"something real touches {clash.name}"
-    return f"{what} (frame {clash.worst.frame}, {clash.worst.time_s:.2f} s); {sure_text(clash)}"
-
-
-def sure_text(clash: "Clash") -> str:
-    """Return how sure a clash is, in words."""
-    return "sure" if clash.is_sure else "not sure: " + ", ".join(clash.doubts)
-
-
-def worst_text(clash: "Clash") -> str:
-    """Return the clearance of a clash in its worst frame, in mm."""
-    lower_m, upper_m = clash.worst.clearance_m
-    if lower_m > 0.0:
-        return f"{bounds_mm(lower_m, upper_m)} away"
-    if upper_m < 0.0:
-        return f"{bounds_mm(-upper_m, -lower_m)} deep"
-    if lower_m == 0.0 or lower_m == float("-inf"):
-        return "touches" if upper_m == 0.0 else f"at most {mm(upper_m, '.1f')} away"
-    return f"at most {mm(-lower_m, '.1f')} deep"
-
-
-def at_95_text(clash: "Clash") -> str:
-    """Return what the clearance is at least at 95 %, in mm."""
-    at_least_m, lower_m = clash.worst.at_least_m, clash.worst.clearance_m[0]
-    if at_least_m != at_least_m:
-        return "-"
-    text = at_least_mm(at_least_m, lower_m)
-    return f"at most {text.removeprefix('-')} deep" if at_least_m < 0.0 else f"at least {text}"
 
 
 def _rows(listed: "tuple[Listed, ...]") -> list[tuple[str, ...]]:

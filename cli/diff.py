@@ -9,7 +9,7 @@ import click
 
 from hybridve.calib.lengths import bounds_mm, mm
 from hybridve.cli import options
-from hybridve.cli.clashes import counted_clashes, worst_text
+from hybridve.hull.report.wording import counted_clashes, worst_text
 
 if TYPE_CHECKING:
     from hybridve.hull.report.changes import Compared, Comparison

@@ -19,6 +19,7 @@ from hybridve.cli.demo import demo
 from hybridve.cli.detect import detect
 from hybridve.cli.diff import diff
 from hybridve.cli.doctor import doctor
+from hybridve.cli.export import export
 from hybridve.cli.init import init
 from hybridve.cli.plan import plan
 from hybridve.cli.render import render
@@ -68,7 +69,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 for command in (
     *(demo, synth, plan, init, board, check, calibrate, convert, segment, detect),
-    *(spacing, sweep, simulate, summary, clashes, diff, render, doctor),
+    *(spacing, sweep, simulate, summary, clashes, diff, export, render, doctor),
 ):
     cli.add_command(command)
 

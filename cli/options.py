@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import click
 
+from hybridve.hull.report.wording import counted as counted
+
 EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
 
 if TYPE_CHECKING:
@@ -275,11 +277,6 @@ def refuse_suffix(picture: Path) -> None:
 def command_line() -> str:
     """Return what was called, for the files that it makes."""
     return " ".join(["hybridve", *sys.argv[1:]])
-
-
-def counted(count: int, what: str) -> str:
-    """Return "1 frame", "2 frames"."""
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:

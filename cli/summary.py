@@ -1,7 +1,6 @@
 """``hybridve summary``: what a report found, as text, JSON or curves."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,10 +8,9 @@ import click
 
 from hybridve.calib.lengths import at_least_mm, bounds_mm, mm
 from hybridve.cli import options
-from hybridve.cli.clashes import counted_clashes, sure_text, worst_text
+from hybridve.hull.report.wording import counted_clashes, overall_text
 
 if TYPE_CHECKING:
-    from hybridve.hull.report.clashes import Clash
     from hybridve.hull.report.read import Report
 
 #: Beginnings of contact that are told of each object; the report and --json have all.
@@ -23,9 +21,6 @@ _MOST_WHY = 3
 
 #: Names in a list of objects, and numbers in one of frames.
 _MOST_NAMES = 8
-
-#: Names of objects in the first line.
-_MOST_FIRST = 3
 
 
 @click.command(short_help="Tell what a report found.")
@@ -86,7 +81,7 @@ def print_summary(report: "Report") -> None:
 
     numbers = summarize(report)
     clashes = gather_clashes(report, rules=()).clashes
-    click.echo(_overall_text(numbers, clashes))
+    click.echo(overall_text(numbers, clashes))
     about = f"{numbers['report']}: {numbers['frames']} frames, {numbers['seconds']:.2f} s"
     if clashes:
         about += f"; `hybridve clashes` tells of {counted_clashes(len(clashes))}"
@@ -167,89 +162,6 @@ def _print_causes(causes: list[dict[str, Any]]) -> None:
             f"  {camera}'s silhouettes fit none of the others in {len(runs)} runs of frames "
             f"({shown}{more}); look at them (`hybridve render --view agreement`)"
         )
-
-
-def _overall_text(numbers: dict[str, Any], clashes: "Sequence[Clash]") -> str:
-    """Return the answer in one line: who clashes, how surely, where to look."""
-    text = _verdict_text(numbers, clashes)
-    if not numbers["trusted"]:
-        return f"not to be trusted: the cameras contradict each other ({text})"
-    return text
-
-
-#: What is said of objects by the worst verdict on them: of one, and of several.
-_SAID = {
-    "clash": ("is touched", "are touched"),
-    "inside": ("has something real wholly inside", "have something real wholly inside"),
-    "too near": ("has less room than it requires", "have less room than they require"),
-    "unknown": ("is not known about", "are not known about"),
-    "open": (
-        "may not keep its distance: nothing is proved",
-        "may not keep their distance: nothing is proved",
-    ),
-    "not seen": ("stands where the cameras cannot tell", "stand where the cameras cannot tell"),
-}
-
-
-def _verdict_text(numbers: dict[str, Any], clashes: "Sequence[Clash]") -> str:
-    verdict, every = numbers["verdict"], len(numbers["objects"])
-    kept = numbers["objects_by_verdict"].get("kept", 0)
-    is_any_kept = any("kept" in found["frames_by_verdict"] for found in numbers["objects"])
-    rests_on = numbers["kept_rests_on"] if is_any_kept else ""
-    rests = f"; what is kept rests on {rests_on}" if rests_on else ""
-    if kept == every:
-        whom = "the object keeps" if every == 1 else f"all {every} objects keep"
-        return f"kept: {whom} the distance, which is proved{_at_95_text(numbers)}{rests}"
-    parts: list[str] = []
-    for one, count in numbers["objects_by_verdict"].items():
-        if one == "kept":
-            continue
-        of = f"{count} of {options.counted(every, 'object')}" if not parts else f"{count}"
-        text = f"{of} {_SAID[one][count > 1]}"
-        names = [found["name"] for found in numbers["objects"] if found["verdict"] == one]
-        worst = next((clash for clash in clashes if clash.name in names), None)
-        if worst is not None and one == worst.kind:
-            text += f", {_where_text(worst, names, clashes)}"
-        elif one == verdict:
-            text += f" ({_names_text(names)})"
-        parts.append(text)
-    if kept:
-        parts.append(f"{kept} {'keeps' if kept == 1 else 'keep'} the distance")
-    return f"{verdict}: {'; '.join(parts)}{rests}"
-
-
-def _where_text(worst: "Clash", names: list[str], clashes: "Sequence[Clash]") -> str:
-    """Return the worst clash in words, and which other objects are as bad."""
-    required = (
-        f" where {mm(worst.required_m, 'g')} are required" if worst.kind == "too near" else ""
-    )
-    ordered = dict.fromkeys(clash.name for clash in clashes if clash.name in names)
-    others = [name for name in ordered if name != worst.name]
-    then = f", then {_names_text(others)}" if others else ""
-    which = f"{worst.name} worst" if len(names) > 1 else worst.name
-    value = worst_text(worst).replace(" away", " mm away").replace(" deep", " mm deep")
-    return (
-        f"{which}: {value}{required} at {worst.worst.time_s:.2f} s (frame {worst.worst.frame}), "
-        f"{sure_text(worst)}{then}"
-    )
-
-
-def _names_text(names: list[str]) -> str:
-    more = len(names) - _MOST_FIRST
-    shown = ", ".join(names[:_MOST_FIRST])
-    return f"{shown} and {more} more" if more > 0 else shown
-
-
-def _at_95_text(numbers: dict[str, Any]) -> str:
-    """Return which objects might not keep it if outlines are off, in words; else empty."""
-    weak = [
-        found["name"]
-        for found in numbers["objects"]
-        if found["clearance"] is not None
-        and found["clearance"]["at_least_95_m"] is not None
-        and found["required_clearance_m"] > found["clearance"]["at_least_95_m"]
-    ]
-    return f"; if outlines are off, {_names_text(weak)} might not (at 95 %)" if weak else ""
 
 
 def _frames_text(frames_by_verdict: dict[str, int]) -> str:

@@ -24,7 +24,9 @@ def write_curves(path: Path, report: Report) -> None:
         If it cannot be written, or the report has no clearances or no frames.
     """
     curves = [
-        _curve(name, rows, report) for name, rows in report.objects.items() if "clearance_m" in rows
+        curve_of(name, rows, report)
+        for name, rows in report.objects.items()
+        if "clearance_m" in rows
     ]
     if not curves:
         raise ReportError(
@@ -41,7 +43,8 @@ def write_curves(path: Path, report: Report) -> None:
     write_clearances(path, shown, title=title, note="; ".join(notes))
 
 
-def _curve(name: str, rows: ObjectColumns, report: Report) -> ClearanceCurve:
+def curve_of(name: str, rows: ObjectColumns, report: Report) -> ClearanceCurve:
+    """Return the clearance of an object against time, depth counting as negative."""
     lower_m, upper_m = rows["clearance_m"].T
     # Where there is no hull, the lower bound is how far was looked: metres, beyond all that counts.
     lower_m, upper_m = (np.where(np.isfinite(upper_m), edge, np.nan) for edge in (lower_m, upper_m))

@@ -105,6 +105,17 @@ def read_rig(path: Path) -> Rig:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise CalibrationError(f"{path}: not JSON ({error}); expected a rig.json") from error
+    return rig_from_dict(content, str(path))
+
+
+def rig_from_dict(content: Any, path: str) -> Rig:
+    """Return the rig that a rig.json holds, or a report.
+
+    Raises
+    ------
+    CalibrationError
+        If it is not a rig, or of a version that this program does not know; it begins with `path`.
+    """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise CalibrationError(f"{path}: format is {found!r}, expected {FORMAT!r}")

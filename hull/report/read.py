@@ -180,7 +180,7 @@ def read_report(path: Path) -> Report:
     """
     with reading(path, "report", *READ_VERSIONS) as file:
         frames = _columns(file["hybridve/frames"], FRAME_COLUMNS, 0.0, may_be_absent=True)
-        origin_m = _origin(file)
+        origin_m = local_origin_m(file)
         reason = frames["reason"]
         nothing = np.full(len(reason), "", np.str_)
         return Report(
@@ -217,7 +217,7 @@ def _agreement(file: h5py.File, path: Path) -> SessionAgreement:
     return read_strictly(SessionAgreement, told, f"{path}: agreement")
 
 
-def _origin(file: h5py.File) -> NDArray[np.float64]:
+def local_origin_m(file: h5py.File) -> NDArray[np.float64]:
     """Return where the places of a file begin; those of version 1 are in the world."""
     if "hybridve/settings/local_origin_m" not in file:
         return np.zeros(3)
@@ -329,7 +329,7 @@ def read_points(path: Path, name: str, row: int) -> tuple[NDArray[np.float64], N
         start, stop = (int(value) for value in group[RUN_OFFSET.name][row : row + 2])
         runs = Runs(*(group[column.name][start:stop] for column in RUN_COLUMNS))
         xyz_m, triangle = read_mesh(group).points(runs, row)
-        return xyz_m + _origin(file), triangle
+        return xyz_m + local_origin_m(file), triangle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -364,7 +364,7 @@ def read_standing(path: Path) -> dict[str, Standing]:
         As `read_report`.
     """
     with reading(path, "report", *READ_VERSIONS) as file:
-        origin_m = _origin(file)
+        origin_m = local_origin_m(file)
         return {
             name: _standing(group, origin_m) for name, group in file["hybridve/objects"].items()
         }
