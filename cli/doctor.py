@@ -36,6 +36,7 @@ _NEEDS = (
     _Need("tqdm", "tqdm", "progress"),
     _Need("matplotlib.pyplot", "matplotlib", "pictures of curves"),
     _Need("jinja2", "jinja2", "certificate.html"),
+    _Need("av", "av", "films"),
     _Need("cascadio", "cascadio", "STEP files"),
     _Need("mujoco", "mujoco-core", "simulate: rigid bodies, hinges and cloth"),
     _Need("moderngl", "moderngl", "render, and the engines compute and stencil"),

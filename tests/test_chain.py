@@ -6,12 +6,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.pose import angle_between, compose, invert
 from hybridve.calib.record import CalibrationRecord, SecondOpinion
+from hybridve.hull.cad.scene import load_scene
+from hybridve.hull.capture.recording import FrameRange
+from hybridve.hull.capture.session import load_session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
+from hybridve.hull.chain import EvaluateSettings, make_chain
+from hybridve.hull.report.clashes import gather_clashes
 from hybridve.hull.report.read import read_report
+from hybridve.hull.show import pinhole_images
 from hybridve.hull.synth import read_truth, true_masks
 
 Run = Callable[..., int]
@@ -142,3 +149,116 @@ def test_the_pictures_show_the_collision_in_red(run: Run, folder: Path) -> None:
         assert picture is not None
         blue, green, red = picture.astype(int).transpose(2, 0, 1)
         assert ((red > 170) & (green < 60) & (blue < 60)).sum() > 200
+
+
+def frames_of(path: Path) -> list[NDArray[np.uint8]]:
+    import av
+
+    with av.open(str(path)) as film:
+        return [
+            np.asarray(frame.to_ndarray(format="bgr24"), np.uint8) for frame in film.decode(video=0)
+        ]
+
+
+@pytest.mark.slow
+def test_a_film_shows_the_worst_seconds_of_each_clash(
+    run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, report, path = folder / "session", folder / "report.h5", folder / "worst.mp4"
+
+    assert run("render", session, "--scene", session / "scene.toml", "--report", report) == 2, (
+        "an output is wanted"
+    )
+    capsys.readouterr()
+    arguments = ("--scene", session / "scene.toml", "--report", report, "--size", "320x200")
+    assert run("render", session, *arguments, "-o", path, "--no-progress") == 0
+
+    told = capsys.readouterr().out
+    clashes = gather_clashes(read_report(report)).clashes
+    assert len(clashes) >= 1
+    for clash in clashes[:6]:
+        assert f"{clash.name}-" in told
+    pictures = frames_of(path)
+    assert f"{len(pictures)} frames" in told
+    blue, green, red = np.stack(pictures).astype(int).transpose(3, 0, 1, 2)
+    is_red = (red > 150) & (green < 90) & (blue < 90)
+    assert (is_red.sum(axis=(1, 2)) > 20).any()
+
+
+@pytest.mark.slow
+def test_a_camera_sees_its_own_picture_with_the_parts_in_it(run: Run, folder: Path) -> None:
+    session, path = folder / "session", folder / "cam.png"
+    chain = make_chain(
+        load_session(session), load_scene(session / "scene.toml"), EvaluateSettings()
+    )
+    name = chain.session.cameras[1].name
+    (width, height) = chain.views.sizes_px[1]
+
+    arguments = ("--frame", 5, "--from", name, "--size", f"{width}x{height}", "-o", path)
+    assert run("render", session, "--scene", session / "scene.toml", *arguments) == 0
+
+    picture = cv2.imread(str(path))
+    recorded = next(pinhole_images(chain, FrameRange(5, 6)))[1]
+    assert picture is not None
+    assert recorded is not None
+    apart = np.abs(picture.astype(int) - recorded).max(axis=2)
+    assert (apart < 12).mean() > 0.6, "most of it is what was recorded"
+    assert (apart > 40).sum() > 500, "and parts lie over it"
+
+
+@pytest.mark.slow
+def test_texture_and_heat_change_hull_and_parts_and_nothing_else(run: Run, folder: Path) -> None:
+    session, pictures = folder / "session", {}
+    usual = (session, "--scene", session / "scene.toml", "--frame", 6, "--size", "480x300")
+    for name, more in (
+        ("plain", ()),
+        ("texture", ("--texture",)),
+        ("heat", ("--show", "heat", "--frames", "0:16:5")),
+    ):
+        path = folder / f"{name}.png"
+        assert run("render", *usual, *more, "-o", path, "--no-progress") == 0
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        pictures[name] = picture.astype(int)
+
+    for name in ("texture", "heat"):
+        changed = np.abs(pictures[name] - pictures["plain"]).max(axis=2) > 20
+        assert 0.002 < changed.mean() < 0.4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("-o", "a.mp4", "--frames", "900:910"), "the recording has none of the frames 900:910"),
+        (("-o", "a.png", "--from", "cam9"), "there is no camera 'cam9' to see from; it has cam"),
+        (("-o", "a.png", "--focus", "nose"), "there is no object 'nose' to look at; it has "),
+        (("-o", "a.png", "--show", "paths"), "--show paths and arrows are of a report"),
+        (("-o", "a.png", "--from", "orbit"), "--from orbit goes around; it is of films"),
+        (("-o", "a.mp4", "--view", "cameras"), "a film is of the scene"),
+        (
+            (
+                "-o",
+                "a.avi",
+            ),
+            "pictures are .png or .jpg, films .mp4",
+        ),
+    ],
+)
+@pytest.mark.slow
+def test_what_cannot_be_drawn_is_one_line_and_no_file(
+    run: Run,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    told: str,
+) -> None:
+    session = folder / "session"
+    monkeypatch.chdir(tmp_path)
+
+    assert run("render", session, "--scene", session / "scene.toml", *arguments) in (1, 2)
+
+    lines = [line for line in capsys.readouterr().err.splitlines() if told in line]
+    assert len(lines) == 1
+    assert list(tmp_path.iterdir()) == []

@@ -260,3 +260,28 @@ def test_one_frame_alone_can_be_drawn(tmp_path: Path) -> None:
 def test_curves_of_other_endings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"charts are \.png, \.svg, \.pdf"):
         write_clearances(tmp_path / "curves.gif", [clearance_curve()], title="")
+
+
+@pytest.mark.parametrize("dip_mm", [10.0, -10.0])
+def test_a_dip_of_10_mm_shows_beside_800(dip_mm: float) -> None:
+    """In one frame of many something comes as near: a share of the panel that nobody overlooks."""
+    lower_mm = np.full(N_FRAMES, 800.0)
+    lower_mm[3] = dip_mm
+    curve = clearance_curve(
+        lower_mm=lower_mm,
+        upper_mm=lower_mm + 0.1,
+        at_least_mm=lower_mm,
+        clashes=lower_mm < 0,
+        required_mm=5.0,
+    )
+
+    figure = draw_clearances([curve, clearance_curve("near")], title="two")
+
+    far, near = figure.axes
+    figure.canvas.draw()
+    bottom, top = (far.transData.transform((0, y))[1] for y in far.get_ylim())
+    zero, dip = (far.transData.transform((0, y))[1] for y in (0.0, dip_mm))
+    assert abs(dip - zero) / (top - bottom) > 0.2
+    # What is near all the time is drawn evenly: half as high is half as high.
+    heights = near.transData.transform([(0, 0.0), (0, 20.0), (0, 40.0)])[:, 1]
+    assert heights[1] - heights[0] == pytest.approx(heights[2] - heights[1])

@@ -30,11 +30,14 @@ from hybridve.calib.errors import ReportError
 from hybridve.calib.lens import project_points
 from hybridve.calib.rig import Rig
 from hybridve.hull.query.silhouettes import Hull, make_hull
+from hybridve.hull.view.drawn import Marks, Measure
 from hybridve.hull.view.picture import (
+    HeatScale,
     choose_viewpoint,
     contact_sheet,
     draw_overlay,
     draw_picture,
+    sheet_layout,
     write_picture,
 )
 
@@ -268,6 +271,91 @@ def test_the_overlay_shows_silhouette_and_collision() -> None:
     plain = draw_overlay(grey, bent_camera(), silhouette, [free])
     assert (image[middle][..., 2] > 1.3 * image[middle][..., 0]).mean() > MOST
     assert (plain[middle][..., 2] < plain[middle][..., 0]).all()
+
+
+def test_what_the_hull_hides_is_faint_in_the_overlay() -> None:
+    """The left half of the image has the hull before the box, the right half behind it."""
+    grey = np.full((480, 640, 3), 128, np.uint8)
+    depth_m = np.full((480, 640), 1.0, np.float32)
+    depth_m[:, 320:] = 4.0
+    nothing = np.zeros((480, 640), np.uint8)
+
+    image = draw_overlay(
+        grey, bent_camera(), nothing, [box("half", (0, 0, 2.0), 0.4)], hull_depth_m=depth_m
+    )
+
+    changed = np.abs(image.astype(int) - 128).sum(axis=2)
+    left, right = changed[220:260, 290:310], changed[220:260, 330:350]
+    assert left.mean() > 0
+    assert left.mean() < 0.4 * right.mean()
+
+
+def test_a_clearance_is_a_line_between_its_points_with_its_number() -> None:
+    camera = bent_camera()
+    start, end = np.array([-0.3, 0.2, 2.0]), np.array([0.3, 0.2, 2.0])
+    grey = np.full((480, 640, 3), 128, np.uint8)
+    nothing = np.zeros((480, 640), np.uint8)
+
+    def drawn(text: str) -> NDArray[np.uint8]:
+        measure = Measure(start, end, text, (0.0, 0.0, 1.0))
+        return draw_overlay(grey, camera, nothing, [], measures=(measure,))
+
+    bare, told = drawn(""), drawn("464.4 mm")
+    blue = (bare[..., 0] > 200) & (bare[..., 2] < 60)
+    rows, columns = np.nonzero(blue)
+    expected, _ = project_points(camera, np.stack([start, end]))
+    assert columns.min() == pytest.approx(expected[0, 0], abs=2)
+    assert columns.max() == pytest.approx(expected[1, 0], abs=2)
+    assert np.abs(rows - expected[:, 1].mean()).max() < 4
+    assert (told != bare).any(axis=2).sum() > 200
+
+
+def test_a_measure_is_drawn_into_the_scene_from_end_to_end(scene: tuple[Hull, Rig]) -> None:
+    ends = np.array([[0.0, -0.6, 0.3], [0.0, 0.6, 0.3]])
+    measure = Measure(ends[0], ends[1], "12 mm", (0.0, 1.0, 0.0))
+    view = view_from(4, 0, 0)
+
+    image = draw_picture(
+        *scene, [], viewpoint=view, size_px=SIZE_PX, marks=Marks(measures=(measure,))
+    )
+
+    green = (image[..., 1] > 180) & (image[..., 0] < 90) & (image[..., 2] < 90)
+    _, columns = np.nonzero(green)
+    expected = pixels_of(view, ends, SIZE_PX)[:, 0]
+    assert columns.min() == pytest.approx(expected.min(), abs=3)
+    assert columns.max() == pytest.approx(expected.max(), abs=3)
+
+
+def test_the_warmth_of_a_part_is_the_colour_of_its_scale(scene: tuple[Hull, Rig]) -> None:
+    """A box that is cold at one side and hot at the other, by the brightness of the red in it."""
+    plain = box("heated", (0.9, 0.0, 0.0), (0.02, 1.0, 0.4))
+    warmth = (plain.vertices_world[:, 1] > 0).astype(np.float32)
+    heat = HeatScale(0.25, 0.003, "frames 0 to 9")
+    view = view_from(4, 0, 0)
+
+    image = draw_picture(
+        *scene, [replace(plain, warmth=warmth)], viewpoint=view, size_px=SIZE_PX, heat=heat
+    )
+
+    ends = np.array([[0.91, -0.45, 0.0], [0.91, 0.45, 0.0]])
+    (cold, hot) = pixels_of(view, ends, SIZE_PX).astype(int)
+    blue, _, red = image[cold[1], cold[0]].astype(int)
+    assert blue > red
+    blue, green, red = image[hot[1], hot[0]].astype(int)
+    assert red > 2 * max(blue, green)
+    assert heat.warmth(np.array([0.0, 0.125, 0.25, 9.0])).tolist() == [1.0, 0.5, 0.0, 0.0]
+
+
+def test_twenty_pictures_make_a_sheet_and_no_strip() -> None:
+    columns, share = sheet_layout([(2048, 1536)] * 20, (3200, 2400))
+
+    rows = -(-20 // columns)
+    width, height = columns * share * 2048, rows * share * 1536
+    assert width <= 3200
+    assert height <= 2400
+    assert 1.0 < width / height < 1.7
+    assert sheet_layout([(640, 480)] * 4, (3200, 2400)) == (2, 1.0)
+    assert sheet_layout([(640, 480)], (3200, 2400)) == (1, 1.0)
 
 
 def test_a_contact_sheet_holds_pictures_of_unequal_size() -> None:

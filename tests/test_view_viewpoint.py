@@ -12,7 +12,15 @@ from hybridve.hull.view.cells import hull_cells
 from hybridve.hull.view.drawn import DrawnObject, thinned
 from hybridve.hull.view.labels import Labels, fitted, text_size
 from hybridve.hull.view.paint import camera_corners, camera_length_m, floor_under, round_length
-from hybridve.hull.view.viewpoint import choose_viewpoint, fitting_eye, overview, up_axis
+from hybridve.hull.view.viewpoint import (
+    Focus,
+    choose_viewpoint,
+    fitting_eye,
+    orbited,
+    overview,
+    up_axis,
+    zoomed,
+)
 
 ASPECT = 1.6
 
@@ -217,3 +225,50 @@ def test_dots_are_thinned_to_one_a_cell() -> None:
 
     np.testing.assert_array_equal(thinned(points, 1.0), [0, 2, 4])
     assert len(thinned(np.zeros((0, 2)), 1.0)) == 0
+
+
+def test_in_focus_a_small_part_fills_the_picture() -> None:
+    """Beside a ball ten times as large, which would make it a dot."""
+    views = ring_views(4)
+    hull, rig = ball_hull(views, np.zeros(3), 0.4), rig_of(views)
+    part = plate((0.8, 0.0, 0.0), (0.04, 0.04, 0.04))
+
+    whole = choose_viewpoint(hull, rig, [part], aspect=ASPECT)
+    focus = Focus(part.vertices_world, ("plate",))
+    near = choose_viewpoint(hull, rig, [part], aspect=ASPECT, focus=focus)
+
+    extents = []
+    for viewpoint in (whole, near):
+        view = viewpoint.novel_view(ASPECT, (0.01, 100.0))
+        extents.append(np.ptp(view.pixels(part.vertices_world, (1600, 1000))[0], axis=0).max())
+    assert extents[0] < 100
+    assert extents[1] > 500
+
+
+def test_zoomed_in_a_length_is_so_many_times_as_long_and_its_point_in_the_middle() -> None:
+    views = ring_views(4)
+    viewpoint = choose_viewpoint(ball_hull(views, np.zeros(3), 0.4), rig_of(views), [])
+    point = viewpoint.target_world + 0.02 * np.array([0.0, 0.0, 1.0])
+
+    near = zoomed(viewpoint, 5.0, point)
+
+    size_px, tips = (1600, 1000), point + np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
+    before, after = (
+        one.novel_view(ASPECT, (0.01, 100.0)).pixels(tips, size_px)[0] for one in (viewpoint, near)
+    )
+    np.testing.assert_allclose(after.mean(axis=0), (800, 500), atol=0.01)
+    lengths = [float(np.linalg.norm(ends[1] - ends[0])) for ends in (before, after)]
+    assert lengths[1] == pytest.approx(5.0 * lengths[0], rel=0.01)
+
+
+def test_an_orbit_keeps_its_distance_and_its_target() -> None:
+    views = ring_views(4)
+    viewpoint = choose_viewpoint(ball_hull(views, np.zeros(3), 0.4), rig_of(views), [])
+
+    eyes = np.array([orbited(viewpoint, angle).eye_world for angle in np.linspace(0, 2 * np.pi, 5)])
+
+    away = eyes - viewpoint.target_world
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), np.linalg.norm(away[0]))
+    np.testing.assert_allclose(eyes[:, 2], eyes[0, 2], atol=1e-12)
+    np.testing.assert_allclose(away[2, :2], -away[0, :2], atol=1e-12)
+    np.testing.assert_allclose(eyes[4], eyes[0], atol=1e-12)

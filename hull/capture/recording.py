@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -37,6 +38,8 @@ from hybridve.hull.capture.tracks import Tracks
 _log = logging.getLogger(__name__)
 
 Mask = NDArray[np.uint8]
+
+_Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 #: How many frames a camera is read ahead: enough to smooth out a slow frame.
 _READ_AHEAD = 3
@@ -348,11 +351,13 @@ def undistort_mask(mask: Mask, undistortion: Undistortion) -> Mask:
     )
 
 
-def as_recorded(mask: Mask, camera: Camera, undistortion: Undistortion) -> Mask:
+def as_recorded(
+    mask: NDArray[_Pixel], camera: Camera, undistortion: Undistortion
+) -> NDArray[_Pixel]:
     """Return a mask of the pinhole image, (h, w), as the lens bends it into the recorded, (H, W).
 
-    0 where the pinhole image has nothing. The lens is asked every 8 pixels and taken to be even
-    between.
+    Or anything else that a pinhole image tells pixel by pixel, as uint8 or float32. 0 where the
+    pinhole image has nothing. The lens is asked every 8 pixels and taken to be even between.
     """
     if undistortion.map_x is None:
         return mask
@@ -366,9 +371,8 @@ def as_recorded(mask: Mask, camera: Camera, undistortion: Undistortion) -> Mask:
     at_y, at_x = ((np.arange(extent, dtype=np.float32) + 0.5) / _LENS_STEP_PX for extent in size)
     fine = cv2.remap(coarse, *np.meshgrid(at_x, at_y), cv2.INTER_LINEAR)
     fine = np.where(np.isfinite(fine), fine, np.float32(-2.0))
-    return np.asarray(
-        cv2.remap(mask, fine[..., 0], fine[..., 1], cv2.INTER_NEAREST, borderValue=0), np.uint8
-    )
+    bent = cv2.remap(mask, fine[..., 0], fine[..., 1], cv2.INTER_NEAREST, borderValue=0)
+    return np.asarray(bent, mask.dtype)
 
 
 def _mask_source(session: Session, camera: SessionCamera) -> FrameSource:

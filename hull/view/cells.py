@@ -52,7 +52,9 @@ class Cells:
         return self.centers_local.min(axis=0) - half, self.centers_local.max(axis=0) + half
 
 
-def hull_cells(hull: Hull, points_world: NDArray[np.float64] | None = None) -> Cells:
+def hull_cells(
+    hull: Hull, points_world: NDArray[np.float64] | None = None, most: int = _MOST_CELLS
+) -> Cells:
     """Return cubes that contain the hull, as far as anybody looks.
 
     The space looked at is a cube about the views' local origin, half as large again as the
@@ -65,6 +67,8 @@ def hull_cells(hull: Hull, points_world: NDArray[np.float64] | None = None) -> C
         The visual hull of one frame.
     points_world : (P, 3) float64, optional
         What else the scene holds, in metres.
+    most : int
+        How many cubes at most; few tell sooner, and more roughly, where the hull is.
     """
     views = hull.views
     reach_m = float(np.linalg.norm(views.centers_local(), axis=1).max())
@@ -80,7 +84,7 @@ def hull_cells(hull: Hull, points_world: NDArray[np.float64] | None = None) -> C
         cells = cells[verdicts(hull, corners) != FREE]
         if len(cells) == 0:
             break
-        if 8 * len(cells) > _MOST_CELLS or edge_m < _SMALLEST_EDGE * reach_m:
+        if 8 * len(cells) > most or edge_m < _SMALLEST_EDGE * reach_m:
             break
         edge_m /= 2
         cells = (cells[:, None] + (_CORNERS - 0.5) * edge_m).reshape(-1, 3)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
@@ -309,6 +309,10 @@ def _label_axes(tradeoff: Axes, missed: Axes, chosen: str) -> None:
 
 _BOUNDS, _AT_LEAST, _CLASH, _REQUIRED = "#0072B2", "#009E73", "#D55E00", "#CC79A7"
 
+#: Up to so many mm, or up to what is required, a clearance is drawn evenly; a curve that reaches so
+#: many times as far has the rest of its axis in tenfold steps.
+_EVEN_MM, _FAR = 10.0, 5.0
+
 #: Height of an object's panel, and of all around the panels, inches.
 _PANEL_IN, _AROUND_IN = 1.7, 1.3
 
@@ -359,6 +363,31 @@ def draw_clearances(curves: Sequence[ClearanceCurve], *, title: str, note: str =
     )
     figure.suptitle("\n".join([*textwrap.wrap(title, 110), note]).strip(), fontsize=10)
     return figure
+
+
+def _scale_clearance(axes: Axes, curve: ClearanceCurve) -> None:
+    """Have what is near seen beside what is far: there each 10 mm count, farther out each tenfold.
+
+    Nothing changes where all of a curve is near, or all of it is far.
+    """
+    known_mm = np.concatenate([curve.lower_mm, curve.upper_mm, curve.at_least_mm])
+    known_mm = known_mm[np.isfinite(known_mm)]
+    if len(known_mm) == 0:
+        return
+    even_mm = max(_EVEN_MM, curve.required_mm)
+    largest_mm, nearest_mm = float(np.abs(known_mm).max()), float(known_mm.min())
+    if largest_mm < _FAR * even_mm or nearest_mm > largest_mm / _FAR:
+        return
+    axes.set_yscale("symlog", linthresh=even_mm, linscale=1.0)
+    decades = [digit * 10.0**power for power in range(5) for digit in (1, 2, 5)]
+    inside = [value for value in decades if even_mm < value <= 1.3 * largest_mm]
+    ticks = [*(value for value in inside if str(value)[0] in "15"), even_mm, 0.0]
+    lowest_mm = min(0.0, nearest_mm)
+    ticks += [-value for value in ticks if 0.0 < value <= -1.3 * lowest_mm]
+    axes.yaxis.set_major_locator(FixedLocator(ticks))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_ylim(1.3 * lowest_mm - 0.15 * even_mm, 1.3 * float(known_mm.max()))
 
 
 def _draw_clearance(axes: Axes, curve: ClearanceCurve) -> None:
@@ -413,6 +442,7 @@ def _draw_clearance(axes: Axes, curve: ClearanceCurve) -> None:
             label="first contact (estimate)",
         )
     axes.set_xlim(time_s[0] - half_s, time_s[-1] + half_s)
+    _scale_clearance(axes, curve)
     axes.set_title(curve.name, fontsize=9, loc="left", pad=2)
     axes.set_ylabel("mm", fontsize=8)
     axes.tick_params(labelsize=8)

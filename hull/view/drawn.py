@@ -26,6 +26,8 @@ class DrawnObject:
         The collision points, in metres.
     share_lit : (T,) float or None
         Of each triangle how much of it a lamp of the scene reaches: the rest is drawn darker.
+    warmth : (V,) float or None
+        Of each vertex how near something came, from 0 to 1: it is coloured by the heat's scale.
     """
 
     name: str
@@ -35,11 +37,40 @@ class DrawnObject:
     hit_triangles: NDArray[np.uint32]
     hit_points_world: NDArray[np.float64]
     share_lit: NDArray[np.floating] | None = None
+    warmth: NDArray[np.floating] | None = None
 
     @property
     def corners_world(self) -> NDArray[np.float64]:
         """The vertices of each triangle, (T, 3, 3) metres."""
         return self.vertices_world[self.faces]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measure:
+    """A line with a number: a clearance between two points, or an arrow.
+
+    Attributes
+    ----------
+    start_world, end_world : (3,) float64
+        Its ends, metres.
+    text : str
+        Written at its middle; empty for nothing.
+    rgb : (float, float, float)
+        Its colour, 0 to 1.
+    has_head : bool
+        Whether it is an arrow.
+    """
+
+    start_world: NDArray[np.float64]
+    end_world: NDArray[np.float64]
+    text: str
+    rgb: tuple[float, float, float]
+    has_head: bool = False
+
+    @property
+    def middle_world(self) -> NDArray[np.float64]:
+        """The point half way."""
+        return np.asarray((self.start_world + self.end_world) / 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,11 +86,14 @@ class Marks:
         of its places, as in figure 5 of the paper.
     head_every : int
         Places from one head to the next.
+    measures : tuple of Measure
+        Lines with numbers, and arrows.
     """
 
     points_world: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     paths_world: tuple[NDArray[np.float64], ...] = ()
     head_every: int = 5
+    measures: tuple[Measure, ...] = ()
 
 
 def thinned(points: NDArray[np.float64], spacing: float) -> NDArray[np.int64]:

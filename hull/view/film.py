@@ -1,48 +1,58 @@
-"""Pictures one after another, as a film."""
+"""Pictures one after another, as a film that browsers play: H.264 in an MP4."""
 
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
+from hybridve.calib.files import appearing
 
 #: What a film may be written as.
 FILMS = (".mp4",)
+
+#: Quality, as x264 counts it: lower is better, 18 is hardly told from the pictures.
+_QUALITY = "21"
 
 
 def write_film(path: Path, images: Iterable[NDArray[np.uint8]], fps: float) -> int:
     """Write pictures (H, W, 3) BGR of one size as a film, and return how many they were.
 
-    The file appears only when it is complete.
+    The colours are halved in each direction (yuv420p), as players expect; a row or a column too
+    many for that is left out. The file appears only when it is complete.
 
     Raises
     ------
     ReportError
         If there is no picture, or the place cannot be written to.
     """
-    # OpenCV goes by the end of the name.
-    partial = path.with_name(f"{path.name}.partial{path.suffix}")
-    writer = None
+    import av  # late: it brings FFmpeg
+
     count = 0
     try:
-        for image in images:
-            if writer is None:
-                size_px = (image.shape[1], image.shape[0])
-                code = cv2.VideoWriter.fourcc(*"mp4v")
-                writer = cv2.VideoWriter(str(partial), code, fps, size_px)
-                if not writer.isOpened():
-                    raise ReportError(f"{path}: cannot be written; name a place that can")
-            writer.write(image)
-            count += 1
-        if writer is None:
-            raise ReportError(f"{path}: there is no picture to make a film of")
-        writer.release()
-        partial.replace(path)
-    finally:
-        if writer is not None:
-            writer.release()
-        partial.unlink(missing_ok=True)
+        with appearing(path) as partial:
+            # What is told first stands first, so that a film plays while it is still loaded.
+            options = {"movflags": "faststart"}
+            with av.open(str(partial), "w", format="mp4", options=options) as container:
+                stream = None
+                for image in images:
+                    if stream is None:
+                        rate = Fraction(fps).limit_denominator(1001)
+                        stream = container.add_stream(
+                            "libx264", rate=rate, options={"crf": _QUALITY, "preset": "veryfast"}
+                        )
+                        stream.height, stream.width = (side // 2 * 2 for side in image.shape[:2])
+                        stream.pix_fmt = "yuv420p"
+                    even = np.ascontiguousarray(image[: stream.height, : stream.width])
+                    frame = av.VideoFrame.from_ndarray(even, format="bgr24")
+                    container.mux(stream.encode(frame))
+                    count += 1
+                if stream is None:
+                    raise ReportError(f"{path}: there is no picture to make a film of")
+                container.mux(stream.encode(None))
+    except OSError as error:  # PyAV's errors are such
+        reason = error.strerror or str(error)
+        raise ReportError(f"{path}: cannot be written ({reason}); name a place that can") from error
     return count

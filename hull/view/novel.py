@@ -8,7 +8,7 @@ The novel view is a pinhole camera, or a parallel one, that looks along `forward
 measured along it, so that it compares with the depth of anything else that is drawn.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 
@@ -55,6 +55,11 @@ class NovelView:
         The nearest and farthest depth drawn; the nearest is positive unless parallel.
     parallel : bool
         Whether all rays are parallel.
+    middle : (2,) float64
+        Where the middle of the picture lies off `forward`, along right and down, as tangents: a
+        camera's principal point is not quite in the middle of its image.
+    skew : float
+        How far right, as a tangent, the lower border lies of the middle.
     """
 
     eye_world: NDArray[np.float64]
@@ -64,6 +69,29 @@ class NovelView:
     half_extent: NDArray[np.float64]
     range_m: tuple[float, float]
     parallel: bool = False
+    middle: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    skew: float = 0.0
+
+    @property
+    def ray_axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """What a ray is made of: to the picture's right border, to its lower one, to its middle.
+
+        A ray through (x, y), which run from -1 to 1 across the picture, is ``x right + y down +
+        middle``, a metre deep.
+        """
+        right, down = self.right * self.half_extent[0], self.down * self.half_extent[1]
+        middle = self.forward + self.middle[0] * self.right + self.middle[1] * self.down
+        return right, down + self.skew * self.right, middle
+
+    def places(self, points_view: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where points (N, 3) of `view_points` appear, (N, 2) from -1 to 1.
+
+        They must not be as deep as the eye, unless the view is parallel.
+        """
+        away = 1.0 if self.parallel else points_view[:, 2:]
+        across = points_view[:, :2] / away - self.middle
+        down = across[:, 1] / self.half_extent[1]
+        return np.stack([(across[:, 0] - self.skew * down) / self.half_extent[0], down], axis=1)
 
     def view_points(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points (N, 3) along right, down and forward of the eye, in metres."""
@@ -76,12 +104,11 @@ class NovelView:
 
         Pixels are (N, 2), NaN where a point is nearer than the nearest depth; depths (N,) metres.
         """
-        right, down, depth_m = self.view_points(points_world).T
+        points_view = self.view_points(points_world)
+        depth_m = points_view[:, 2]
         pixels = np.full((len(points_world), 2), np.nan)
         in_front = depth_m >= self.range_m[0]
-        away = 1.0 if self.parallel else depth_m[in_front]
-        across = np.stack([right[in_front] / away, down[in_front] / away], axis=1)
-        pixels[in_front] = (across / self.half_extent + 1.0) / 2.0 * size_px
+        pixels[in_front] = (self.places(points_view[in_front]) + 1.0) / 2.0 * size_px
         return pixels, depth_m
 
     def clip_from_local(self, origin_world: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,7 +118,11 @@ class NovelView:
         view_from_local[:3, :3] = np.stack([self.right, self.down, self.forward])
         view_from_local[:3, 3] = self.view_points(origin_world[None])[0]
         clip_from_view = np.zeros((4, 4))
-        clip_from_view[[0, 1], [0, 1]] = 1.0 / self.half_extent
+        half, (middle_x, middle_y) = self.half_extent, self.middle
+        clip_from_view[1, 1:3] = np.array([1.0, -middle_y]) / half[1]
+        clip_from_view[0, :3] = (
+            np.array([1.0, 0.0, -middle_x]) - self.skew * clip_from_view[1, :3]
+        ) / half[0]
         if self.parallel:
             clip_from_view[2, 2:] = np.array([2.0, -(far + near)]) / (far - near)
             clip_from_view[3, 3] = 1.0
@@ -107,11 +138,12 @@ class NovelView:
 
         A point of a ray is ``origin + depth * direction``.
         """
-        place = (2.0 * pixels / size_px - 1.0) * self.half_extent
-        across = place[:, :1] * self.right + place[:, 1:] * self.down
+        place = 2.0 * pixels / size_px - 1.0
+        right, down, middle = self.ray_axes
+        across = place[:, :1] * right + place[:, 1:] * down
         if self.parallel:
-            return self.eye_world + across, np.broadcast_to(self.forward, across.shape).copy()
-        return np.broadcast_to(self.eye_world, across.shape).copy(), self.forward + across
+            return self.eye_world + across, np.broadcast_to(middle, across.shape).copy()
+        return np.broadcast_to(self.eye_world, across.shape).copy(), middle + across
 
 
 def first_surface(
@@ -175,6 +207,20 @@ def set_uniforms(program: moderngl.Program, **values: object) -> None:
             program[name] = value
 
 
+def clear_all(
+    target: moderngl.Framebuffer,
+    values: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+) -> None:
+    """Clear all of a target, whatever rectangle was drawn in before, in this target or another."""
+    target.use()
+    target.scissor = (0, 0, *target.size)
+    target.clear(*values, depth=1.0)
+
+
+#: What a target of depths is cleared with.
+NOTHING = (NEVER_M, 0.0, 0.0, 0.0)
+
+
 def draw_within(
     target: moderngl.Framebuffer,
     rectangle: tuple[int, int, int, int],
@@ -207,6 +253,10 @@ class HullOnDevice:
     ----------
     cells : Cells
         Where the hull is.
+    regions : list of (first, size, matrix)
+        What of each camera's image is held: its first pixel (2,), its width and height, and the
+        projection (3, 4) into its pixels from metres in the local frame. Empty if nothing is
+        inside.
     """
 
     def __init__(
@@ -232,6 +282,7 @@ class HullOnDevice:
         height = max((region.distance.shape[0] for region in regions), default=1)
         n_layers = max(1, len(regions))
         cameras = np.zeros((n_layers, 4, 4), np.float64)
+        self.regions: list[tuple[NDArray[np.int64], tuple[int, int], NDArray[np.float64]]] = []
         size = (width, height, n_layers)
         self._distances = self._device.texture_array(size, 1, alignment=1, dtype="u1")
         self._distances.filter = (moderngl.NEAREST, moderngl.NEAREST)
@@ -243,6 +294,7 @@ class HullOnDevice:
             cameras[camera, :2] -= region.first[:, None] * cameras[camera, 2]
             cameras[camera, 3] = region.window
             rows, columns = region.distance.shape
+            self.regions.append((region.first, (columns, rows), cameras[camera, :3].copy()))
             place = (0, 0, camera, columns, rows, 1)
             self._distances.write(region.distance, viewport=place)
             self._soft.write(region.soft, viewport=place)
@@ -266,7 +318,7 @@ class HullOnDevice:
 
     def draw(self, target: moderngl.Framebuffer, view: NovelView, size_px: tuple[int, int]) -> None:
         """Write depth and normal of the hull's first surface into `target`, `size_px` large."""
-        target.clear(NEVER_M)
+        clear_all(target, NOTHING)
         scissor = self.rectangle(view, size_px)
         if scissor is None:
             return
@@ -299,11 +351,12 @@ class HullOnDevice:
 
 def view_uniforms(view: NovelView, origin_world: NDArray[np.float64]) -> dict[str, object]:
     """Return a view as ``novel.frag.glsl`` and ``compose.frag.glsl`` take it."""
+    right, down, middle = view.ray_axes
     return {
         "eye": tuple(view.eye_world - origin_world),
-        "right": tuple(view.right * view.half_extent[0]),
-        "down": tuple(view.down * view.half_extent[1]),
-        "forward": tuple(view.forward),
+        "right": tuple(right),
+        "down": tuple(down),
+        "forward": tuple(middle),
         "parallel": view.parallel,
         "range_m": view.range_m,
     }

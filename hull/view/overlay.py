@@ -1,14 +1,16 @@
 """One camera's recorded image with the silhouette outlined and the CAD drawn over it."""
 
+from dataclasses import dataclass
+
 import cv2
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
-from hybridve.hull.view.drawn import DrawnObject, thinned
+from hybridve.hull.view.drawn import DrawnObject, Measure, thinned
 from hybridve.hull.view.labels import bgr, plate, put_text, text_size
-from hybridve.hull.view.novel import NEVER_M, load_shader, set_uniforms
+from hybridve.hull.view.novel import NEVER_M, clear_all, load_shader, set_uniforms
 from hybridve.hull.view.paint import (
     COLLIDING,
     FREE,
@@ -28,6 +30,10 @@ _SEEN_THROUGH = {FREE: 0.35, COLLIDING: 0.35, TOUCHED: 0.25}
 #: Stronger than in the drawing: a room is darker and busier than paper.
 _COLOURS = {FREE: (0.42, 0.64, 0.93), COLLIDING: (0.98, 0.70, 0.64), TOUCHED: (0.95, 0.42, 0.36)}
 
+#: How much of its strength CAD keeps where the hull is before it, and from what share of the depth
+#: on it is.
+_HIDDEN, _SLACK = 0.25, 2e-3
+
 #: Longest edge of a triangle in a distorted image, in pixels: longer ones are cut, so that they
 #: bend as the lens bends them (0.2 px off the true curve at a curvature radius of 1000 px).
 _LONGEST_EDGE_PX = 40.0
@@ -37,22 +43,37 @@ _MOST_CUTS = 6
 _POINT_RADIUS_PX, _POINT_SPACING_PX = 1.6, 3.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlay:
+    """What is drawn over a camera's frame; see `hybridve.hull.view.picture.draw_overlay`."""
+
+    objects: list[DrawnObject]
+    hull_depth_m: NDArray[np.float32] | None = None
+    measures: tuple[Measure, ...] = ()
+    share: float = 1.0
+
+
 def overlay_picture(
     device: moderngl.Context,
     image: Image,
     camera: Camera,
     mask: NDArray[np.uint8],
-    objects: list[DrawnObject],
+    over: Overlay,
 ) -> Image:
     """Return the picture; see `hybridve.hull.view.picture.draw_overlay`."""
     from hybridve.calib.lens import project_points  # late: pycolmap takes a quarter of a second
 
-    scale = camera.height_px / 500
-    result = image.copy()
+    # What is drawn must be seen once the picture is as small as it will be.
+    scale = max(camera.height_px / 500, 1.0 / over.share if over.share < 1.0 else 0.0)
+    result, objects = image.copy(), over.objects
     triangles, kinds = _projected_triangles(camera, objects)
     if len(triangles):
-        kind, facing, edge = _rasterised(device, camera, triangles, kinds)
-        result = _blended(result, kind, facing, edge)
+        kind, facing, edge, distance = _rasterised(device, camera, triangles, kinds)
+        hidden = np.zeros(kind.shape, np.bool_)
+        if over.hull_depth_m is not None:
+            before = np.repeat(np.repeat(over.hull_depth_m, 2, axis=0), 2, axis=1)
+            hidden = before * (1.0 + _SLACK) < distance
+        result = _blended(result, kind, facing, edge, hidden)
     contours, _ = cv2.findContours(
         (mask > 0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
     )
@@ -72,8 +93,36 @@ def overlay_picture(
             center = (round((x - 0.5) * 16), round((y - 0.5) * 16))
             radius = round(_POINT_RADIUS_PX * scale * 16)
             cv2.circle(result, center, radius, bgr(INSIDE_RGB), -1, cv2.LINE_AA, 4)
-    _name(result, camera.name, scale)
+    for measure in over.measures:
+        _measure(result, camera, measure, scale)
+    if over.share < 1.0:
+        size = tuple(max(1, round(over.share * extent)) for extent in result.shape[1::-1])
+        result = np.asarray(cv2.resize(result, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _name(result, camera.name, camera.height_px * over.share / 500)
     return result
+
+
+def _measure(image: Image, camera: Camera, measure: Measure, scale: float) -> None:
+    """Draw a line with its number; nothing if an end is behind the camera, or far outside."""
+    from hybridve.calib.lens import project_points  # late: pycolmap takes a quarter of a second
+
+    ends = np.stack([measure.start_world, measure.end_world])
+    pixels, _ = project_points(camera, ends)
+    extent = np.array([camera.width_px, camera.height_px])
+    if not np.isfinite(pixels).all() or (np.abs(pixels - extent / 2) > extent).any():
+        return
+    first, last = ((round(x - 0.5), round(y - 0.5)) for x, y in pixels)
+    width = max(1, round(1.5 * scale))
+    cv2.line(image, first, last, (255, 255, 255), 3 * width, cv2.LINE_AA)
+    cv2.line(image, first, last, bgr(measure.rgb), width, cv2.LINE_AA)
+    if measure.text:
+        size = 0.5 * max(scale, 0.6)
+        wide, above, below = text_size(measure.text, size, bold=True)
+        x, y = (int(value) for value in pixels.mean(axis=0))
+        left = min(max(x - wide // 2, 4), max(camera.width_px - wide - 4, 4))
+        baseline = max(y - round(22 * scale), above + 4)
+        plate(image, (left - 3, baseline - above - 3, left + wide + 3, baseline + below), 0.75)
+        put_text(image, measure.text, (left, baseline), size, measure.rgb, bold=True)
 
 
 def _projected_triangles(
@@ -141,8 +190,8 @@ def _rasterised(
     camera: Camera,
     triangles: NDArray[np.float64],
     kinds: NDArray[np.float64],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return kind, brightness and edge strength of the nearest triangle in each pixel, (H, W)."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return of the nearest triangle in each pixel, (2 H, 2 W): kind, brightness, edge, depth."""
     size = (camera.width_px, camera.height_px)
     twice = (2 * size[0], 2 * size[1])
     program = device.program(
@@ -164,15 +213,14 @@ def _rasterised(
         range_m=(float(depths.min()), float(depths.max()) * (1 + 1e-6) + 1e-6),
         focal_px=float(camera.pinhole[0, 0]),
     )
-    target.use()
-    target.clear(0.0, 0.0, NEVER_M, 0.0, depth=1.0)
+    clear_all(target, (0.0, 0.0, NEVER_M, 0.0))
     device.enable(moderngl.DEPTH_TEST)
     array.render(moderngl.TRIANGLES)
     device.disable(moderngl.DEPTH_TEST)
     drawn = np.frombuffer(texture.read(), np.float32).reshape(twice[1], twice[0], 4)
     kind, facing, distance = drawn[..., 0], drawn[..., 1], drawn[..., 2]
     edge = _edges(kind, facing, distance)
-    return kind, facing, edge
+    return kind, facing, edge, distance
 
 
 def _edges(
@@ -199,8 +247,9 @@ def _blended(
     kind: NDArray[np.float32],
     facing: NDArray[np.float32],
     edge: NDArray[np.float32],
+    hidden: NDArray[np.bool_],
 ) -> Image:
-    """Lay the surfaces, drawn at twice the size, over the image."""
+    """Lay the surfaces, drawn at twice the size, over the image; faintly where they are hidden."""
     height, width = image.shape[:2]
     paint = np.zeros((*kind.shape, 3), np.float32)
     cover = np.zeros(kind.shape, np.float32)
@@ -211,6 +260,7 @@ def _blended(
     paint *= (0.40 + 0.60 * facing)[..., None]
     paint[edge > 0] *= 0.35
     cover[edge > 0] = np.maximum(cover[edge > 0], 0.8)
+    cover[hidden] *= _HIDDEN
     # Colours are weighted by their cover before they are averaged down.
     size = (width, height)
     added = cv2.resize(paint * cover[..., None], size, interpolation=cv2.INTER_AREA)

@@ -4,6 +4,7 @@ Drawn in layers at twice the picture's size in each direction, put together by
 ``shaders/compose.frag.glsl``, and averaged down.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -17,21 +18,27 @@ from hybridve.hull.query.device import make_current, open_device
 from hybridve.hull.query.engine import Closing
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import Cells
-from hybridve.hull.view.drawn import DrawnObject, Marks, thinned
+from hybridve.hull.view.drawn import DrawnObject, Marks, Measure, thinned
 from hybridve.hull.view.novel import (
     NEVER_M,
+    NOTHING,
     HullOnDevice,
     NovelView,
+    clear_all,
     draw_within,
     full_screen,
     load_shader,
     set_uniforms,
     view_uniforms,
 )
+from hybridve.hull.view.skin import SkinOnDevice
 from hybridve.hull.view.strokes import Colour, Strokes
 
 Image = NDArray[np.uint8]
 Rgb = tuple[float, float, float]
+
+#: How fine what the cameras see of the hull is looked at, in pixels of theirs for one drawn.
+_DEPTHS_PER_PX = 0.5
 
 #: Pixels drawn for one pixel of the picture, in each direction.
 _SAMPLES = 2
@@ -51,6 +58,16 @@ POINT_RGB: Rgb = (0.42, 0.0, 0.02)
 MARK_RGB: Rgb = (0.10, 0.42, 0.62)
 PATH_RGB: Rgb = (0.85, 0.45, 0.05)
 CAMERA_RGB: Rgb = (0.22, 0.27, 0.34)
+MEASURE_RGB: Rgb = (0.02, 0.05, 0.45)
+#: Colours of the heat, from far to near: told apart by the colour-blind by their brightness.
+HEAT_RGB: tuple[Rgb, ...] = (
+    (0.62, 0.68, 0.76),
+    (0.55, 0.76, 0.80),
+    (0.78, 0.86, 0.55),
+    (0.98, 0.82, 0.25),
+    (0.95, 0.48, 0.13),
+    (0.72, 0.04, 0.15),
+)
 AXIS_RGB: tuple[Rgb, Rgb, Rgb] = ((0.84, 0.39, 0.33), (0.27, 0.62, 0.34), (0.25, 0.42, 0.80))
 
 #: Dots of collision points: radius, and the distance below which one stands for all, in pixels of
@@ -189,6 +206,11 @@ class PaintedScene:
         The plane of the grid.
     marks : Marks
         What is drawn over it.
+    images : sequence of C (H, W, 3) uint8 or None
+        What the hull's cameras recorded, as pinhole images, BGR: the hull has their colours. Empty
+        for a hull of plain colour.
+    backdrop : (H, W, 3) uint8, or None
+        The whole scene is drawn over this picture, which has the hull in it already, BGR.
     """
 
     hull: Hull
@@ -198,20 +220,31 @@ class PaintedScene:
     camera_m: float
     floor: Floor
     marks: Marks = field(default_factory=Marks)
+    images: Sequence[Image | None] = ()
+    backdrop: Image | None = None
 
 
 class Painter(Closing):
     """Draws scenes; keeps what is compiled from one picture to the next.
 
     The context belongs to the thread that opened it.
+
+    Parameters
+    ----------
+    device : moderngl.Context, optional
+        What to draw with; its own by default.
+    samples : int
+        Pixels drawn for one pixel of the picture, in each direction; 1 is quicker.
     """
 
-    def __init__(self, device: moderngl.Context | None = None) -> None:
+    def __init__(self, device: moderngl.Context | None = None, samples: int = _SAMPLES) -> None:
+        self._samples = samples
         self._owned = device is None
         self._device = open_device() if device is None else device
         self._march = full_screen(self._device, "novel.frag.glsl")
         self._smooth = full_screen(self._device, "smooth.frag.glsl")
         self._compose = full_screen(self._device, "compose.frag.glsl")
+        self._skin = full_screen(self._device, "skin.frag.glsl")
         self._mesh = self._device.program(
             vertex_shader=load_shader("mesh.vert.glsl"),
             fragment_shader=load_shader("mesh.frag.glsl"),
@@ -238,11 +271,27 @@ class Painter(Closing):
         """Return the scene as seen by `view`, (H, W, 3) BGR."""
         make_current(self._device)
         try:
-            picture = self._paint(scene, view, (size_px[0] * _SAMPLES, size_px[1] * _SAMPLES))
+            samples = self._samples
+            picture = self._paint(scene, view, (size_px[0] * samples, size_px[1] * samples))
         finally:
             self._device.gc()
         small = cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGBA2BGR), np.uint8)
+
+    def depth(
+        self, hull: Hull, view: NovelView, size_px: tuple[int, int], cells: Cells | None = None
+    ) -> NDArray[np.float32]:
+        """Return how deep the hull is in each pixel (H, W) of a view, metres; inf for nothing."""
+        make_current(self._device)
+        try:
+            depth = self._device.texture(size_px, 1, dtype="f4")
+            normal = self._device.texture(size_px, 4, dtype="f2")
+            target = self._device.framebuffer([depth, normal])
+            HullOnDevice(self._device, self._march, hull, cells).draw(target, view, size_px)
+            found = np.frombuffer(depth.read(), np.float32).reshape(size_px[1], size_px[0])
+        finally:
+            self._device.gc()
+        return np.asarray(np.where(found < NEVER_M / 2, found, np.inf), np.float32)
 
     def _paint(self, scene: PaintedScene, view: NovelView, size_px: tuple[int, int]) -> Image:
         """Return the scene before it is averaged down, (H, W, 4) RGBA."""
@@ -251,14 +300,27 @@ class Painter(Closing):
         meshes = self._upload_meshes(scene)
         hull.draw(layers.hull, view, size_px)
         self._smooth_normals(layers, hull, view, size_px)
+        if len(scene.images) and scene.backdrop is None:
+            per_px = _DEPTHS_PER_PX * self._samples
+            skin = SkinOnDevice(self._device, scene.hull, hull, scene.images, per_px)
+            sources = (layers.hull_depth, layers.hull_normal)
+            skin.draw(layers.skinned, self._skin, sources, view, size_px)
         self._draw_meshes(layers.mesh, meshes, hull, scene, view, inside_only=False)
         self._draw_meshes(layers.hits, meshes, hull, scene, view, inside_only=True)
         shade = self._floor_shade(scene, hull, meshes)
         layers.use()
         shade.use(8)
+        layers.skin.use(9)
+        if scene.backdrop is not None:
+            self._backdrop(scene.backdrop, size_px).use(10)
         self._compose_layers(layers, scene, view, size_px)
         self._draw_strokes(layers, self._strokes(scene, view, size_px))
         return np.frombuffer(layers.picture.read(), np.uint8).reshape(size_px[1], size_px[0], 4)
+
+    def _backdrop(self, image: Image, size_px: tuple[int, int]) -> moderngl.Texture:
+        fine = cv2.resize(image, size_px, interpolation=cv2.INTER_LINEAR)
+        rgb = np.ascontiguousarray(fine[..., ::-1])
+        return self._device.texture(size_px, 3, rgb.tobytes(), alignment=1)
 
     def _layers_of(self, size_px: tuple[int, int]) -> "_Layers":
         """Return the layers of a size; kept, since the next picture is likely as large."""
@@ -270,21 +332,24 @@ class Painter(Closing):
 
     def _upload_meshes(self, scene: PaintedScene) -> moderngl.VertexArray | None:
         """Upload all triangles; None if there is none."""
-        parts = [np.zeros((0, 4), np.float32)]
+        parts = [np.zeros((0, 5), np.float32)]
         for item in scene.objects:
-            part = np.zeros((len(item.faces), 3, 4), np.float32)
+            part = np.zeros((len(item.faces), 3, 5), np.float32)
+            part[..., 4] = -1.0 if item.warmth is None else item.warmth[item.faces]
             part[..., :3] = item.corners_world - scene.hull.views.origin_world
             part[..., 3] = COLLIDING if item.collides else FREE
             if item.collides:
                 part[item.hit_triangles, :, 3] = TOUCHED
             if item.share_lit is not None:
                 part[..., 3] += DARKEST * (1.0 - np.clip(item.share_lit, 0.0, 1.0))[:, None]
-            parts.append(part.reshape(-1, 4))
+            parts.append(part.reshape(-1, 5))
         vertices = np.concatenate(parts)
         if len(vertices) == 0:
             return None
         buffer = self._device.buffer(vertices.tobytes())
-        return self._device.vertex_array(self._mesh, [(buffer, "3f 1f", "point", "kind")])
+        return self._device.vertex_array(
+            self._mesh, [(buffer, "3f 1f 1f", "point", "kind", "warmth")]
+        )
 
     def _draw_meshes(
         self,
@@ -296,8 +361,7 @@ class Painter(Closing):
         *,
         inside_only: bool,
     ) -> None:
-        target.use()
-        target.clear(NEVER_M, depth=1.0)
+        clear_all(target, NOTHING)
         if meshes is None or (inside_only and not any(item.collides for item in scene.objects)):
             return
         origin = scene.hull.views.origin_world
@@ -394,7 +458,10 @@ class Painter(Closing):
             floor_high=tuple(floor.high_m),
             floor_middle=tuple(middle),
             floor_reach_m=1.1 * float(np.linalg.norm(floor.high_m - floor.low_m)),
-            has_floor=bool(on_floor),
+            has_floor=bool(on_floor) and scene.backdrop is None,
+            has_skin=len(scene.images) > 0 and scene.backdrop is None,
+            has_backdrop=scene.backdrop is not None,
+            heat_colours=HEAT_RGB,
             hull_colour=HULL_RGB,
             free_colour=FREE_RGB,
             colliding_colour=COLLIDING_RGB,
@@ -402,6 +469,7 @@ class Painter(Closing):
             inside_colour=INSIDE_RGB,
         )
         layers.target.use()
+        layers.target.scissor = (0, 0, *size_px)
         triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def _strokes(self, scene: PaintedScene, view: NovelView, size_px: tuple[int, int]) -> Strokes:
@@ -409,7 +477,7 @@ class Painter(Closing):
         scale = size_px[1] / 1000.0
         strokes = Strokes(view, size_px)
         origin, length_m = np.zeros((1, 3)), scene.floor.grid_m
-        for axis, rgb in enumerate(AXIS_RGB):
+        for axis, rgb in enumerate(AXIS_RGB if scene.backdrop is None else ()):
             tip = np.eye(3)[axis][None] * length_m
             strokes.lines(origin, tip, 3.0 * scale, (*rgb, 1.0))
         for camera in scene.cameras:
@@ -425,6 +493,8 @@ class Painter(Closing):
         strokes.dots(scene.marks.points_world, _MARK_RADIUS_PX * scale, (*MARK_RGB, 0.75), 0.1)
         for path in scene.marks.paths_world:
             _add_path(strokes, path, scene.marks.head_every, scale)
+        for measure in scene.marks.measures:
+            _add_measure(strokes, measure, scale)
         return strokes
 
     def _draw_strokes(self, layers: "_Layers", strokes: Strokes) -> None:
@@ -457,6 +527,31 @@ def _add_path(
     length_m = np.linalg.norm(along, axis=1)
     moved = length_m > 0
     tips, along = ends[steps][moved], along[moved] / length_m[moved, None]
+    _add_heads(strokes, tips, along, colour, scale)
+
+
+def _add_measure(strokes: Strokes, measure: Measure, scale: float) -> None:
+    """Add a line with a pale rim, seen through everything; an arrow ends in its head."""
+    start, end = measure.start_world[None], measure.end_world[None]
+    strokes.lines(start, end, 7.0 * scale, (1.0, 1.0, 1.0, 0.75), 0.75)
+    colour: Colour = (*measure.rgb, 1.0)
+    strokes.lines(start, end, _PATH_WIDTH_PX * scale, colour, 1.0)
+    if measure.has_head:
+        length_m = float(np.linalg.norm(end - start))
+        if length_m > 0:
+            _add_heads(strokes, end, (end - start) / length_m, colour, scale)
+    else:
+        strokes.dots(np.concatenate([start, end]), 4.0 * scale, colour, 1.0)
+
+
+def _add_heads(
+    strokes: Strokes,
+    tips: NDArray[np.float64],
+    along: NDArray[np.float64],
+    colour: Colour,
+    scale: float,
+) -> None:
+    """Add heads of arrows at tips (N, 3) along (N, 3); none where that is the line of sight."""
     view = strokes.view
     aside = np.cross(along, view.forward)
     broad = np.linalg.norm(aside, axis=1)
@@ -468,7 +563,7 @@ def _add_path(
     )[:, None]
     back = tips - head_m * along
     corners = np.stack([tips, back + 0.45 * head_m * aside, back - 0.45 * head_m * aside], axis=1)
-    strokes.faces(corners, colour, 0.35)
+    strokes.faces(corners, colour, 0.35 if colour[3] < 1.0 else 1.0)
 
 
 def _add_camera(strokes: Strokes, camera: Camera, length_m: float, scale: float) -> None:
@@ -504,6 +599,8 @@ class _Layers:
         self.mesh_depth, self.mesh_normal = layer(1, "f4"), layer(4, "f2")
         self.hit_depth, self.hit_normal = layer(1, "f4"), layer(4, "f2")
         self.smoothed, self.picture = layer(4, "f2"), layer(4, "f1")
+        self.skin = layer(4, "f1")
+        self.skinned = device.framebuffer([self.skin])
         depth = device.depth_renderbuffer(size_px)
         self.hull = device.framebuffer([self.hull_depth, self.hull_normal])
         self.mesh = device.framebuffer([self.mesh_depth, self.mesh_normal], depth)

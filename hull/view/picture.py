@@ -3,6 +3,7 @@
 What a person looks at first: cameras, the hull, the CAD, and in red what collides.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from hybridve.calib.files import appearing
 from hybridve.calib.rig import Rig
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import hull_cells
-from hybridve.hull.view.drawn import DrawnObject, Marks
+from hybridve.hull.view.drawn import DrawnObject, Marks, Measure
+from hybridve.hull.view.heat_scale import HeatScale, draw_heat
 from hybridve.hull.view.labels import (
     INK,
     LABEL_SIZE,
@@ -31,7 +33,7 @@ from hybridve.hull.view.labels import (
     text_size,
 )
 from hybridve.hull.view.novel import NovelView
-from hybridve.hull.view.overlay import overlay_picture
+from hybridve.hull.view.overlay import Overlay, overlay_picture
 from hybridve.hull.view.paint import (
     AXIS_RGB,
     COLLIDING_RGB,
@@ -47,8 +49,10 @@ from hybridve.hull.view.paint import (
     floor_under,
     round_length,
 )
+from hybridve.hull.view.recorded import view_of_matrix
 from hybridve.hull.view.viewpoint import (
     RASTER_PX,
+    Focus,
     Viewpoint,
     choose_viewpoint,
     focus_points,
@@ -61,12 +65,17 @@ from hybridve.hull.view.viewpoint import (
 
 __all__ = [
     "DrawnObject",
+    "Focus",
+    "HeatScale",
+    "Measure",
     "Painter",
     "Viewpoint",
     "choose_viewpoint",
     "contact_sheet",
+    "draw_from_camera",
     "draw_overlay",
     "draw_picture",
+    "sheet_layout",
     "write_picture",
 ]
 
@@ -96,6 +105,9 @@ def draw_picture(
     title: str = "",
     caption: str = "",
     marks: Marks | None = None,
+    images: Sequence[Image | None] = (),
+    heat: HeatScale | None = None,
+    with_overview: bool = True,
     painter: Painter | None = None,
 ) -> Image:
     """Return the scene from outside.
@@ -120,7 +132,14 @@ def draw_picture(
     title, caption : str
         Written into the upper left corner.
     marks : Marks, optional
-        Points and ways that are drawn over it.
+        Points, ways and measures that are drawn over it.
+    images : sequence of C (H, W, 3) uint8 or None
+        What the hull's cameras recorded, as pinhole images, BGR: the hull is drawn as it looked.
+        None for a camera that no colour is taken from.
+    heat : HeatScale, optional
+        What the colours of objects with `warmth` mean; it is drawn into the picture.
+    with_overview : bool
+        Whether cameras that do not fit into the picture are shown in a small one.
     painter : Painter, optional
         Draws it; for many pictures make one and keep it.
 
@@ -145,6 +164,9 @@ def draw_picture(
                 title=title,
                 caption=caption,
                 marks=marks,
+                images=images,
+                heat=heat,
+                with_overview=with_overview,
                 painter=own,
             )
     aspect = size_px[0] / size_px[1]
@@ -169,16 +191,25 @@ def draw_picture(
     view = viewpoint.novel_view(aspect, _depth_range(viewpoint, everything))
     with_cameras = _are_seen(view, rig.centers_world)
     shown = rig.cameras if with_cameras else ()
-    scene = PaintedScene(hull, cells, objects, shown, camera_m, floor, marks or Marks())
+    scene = PaintedScene(hull, cells, objects, shown, camera_m, floor, marks or Marks(), images)
     image = painter.paint(scene, view, size_px)
     labels = Labels(image, size_px[1] / 1000)
     _write_text(labels, title, caption, scene)
-    if not with_cameras:
+    _write_corner(labels, _grid_text(scene))
+    if heat is not None:
+        labels.reserve(draw_heat(image, heat, labels.scale))
+    if with_overview and not with_cameras:
         small = (round(size_px[0] * _INSET_SHARE), round(size_px[1] * _INSET_SHARE))
         hits = [np.asarray(item.hit_points_world, np.float64) for item in objects]
         wide = overview(np.concatenate([focus, rig.centers_world, frusta]), viewpoint, aspect)
         grid_m = max(floor.grid_m, round_length(float(np.ptp(rig.centers_world, axis=0).max()) / 8))
-        around = replace(scene, cameras=rig.cameras, floor=replace(floor, grid_m=grid_m))
+        around = replace(
+            scene,
+            images=(),
+            marks=replace(scene.marks, measures=()),
+            cameras=rig.cameras,
+            floor=replace(floor, grid_m=grid_m),
+        )
         wide_view = wide.novel_view(aspect, _depth_range(wide, everything))
         inset = painter.paint(around, wide_view, small)
         inset_labels = Labels(inset, 0.85 * size_px[1] / 1000)
@@ -190,18 +221,104 @@ def draw_picture(
     return image
 
 
+def draw_from_camera(
+    hull: Hull,
+    camera: int,
+    image: Image,
+    objects: list[DrawnObject],
+    *,
+    size_px: tuple[int, int],
+    zoom: float = 1.0,
+    at_world: NDArray[np.float64] | None = None,
+    title: str = "",
+    caption: str = "",
+    marks: Marks | None = None,
+    heat: HeatScale | None = None,
+    painter: Painter,
+) -> Image:
+    """Return the scene over what one of the hull's cameras recorded.
+
+    The CAD covers the picture where it is before the hull; where it is behind the hull, the picture
+    covers it. The hull is outlined.
+
+    Parameters
+    ----------
+    hull : Hull
+        The visual hull of one frame.
+    camera : int
+        Which of its cameras.
+    image : (H, W, 3) uint8
+        What it recorded, as pinhole image, BGR.
+    objects, title, caption, marks, heat
+        As of `draw_picture`.
+    size_px : tuple of int
+        Width and height; the picture is as wide as it can be in it, and black beside.
+    zoom : float
+        So many times as large, cut out of the image.
+    at_world : (3,) float64, optional
+        What that is about; the middle of the image otherwise.
+    painter : Painter
+        Draws it.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        BGR.
+    """
+    vertices = [item.vertices_world for item in objects]
+    cells = hull_cells(hull, np.concatenate(vertices) if vertices else None)
+    whole = np.array(image.shape[1::-1])
+    middle = whole / 2
+    if at_world is not None:
+        place = hull.views.project(at_world, camera)
+        middle = place[:2] / place[2] if place[2] > 0 else middle
+    extent = np.maximum(np.minimum(np.rint(whole / max(zoom, 1.0)), whole), 2)
+    first = np.clip(np.rint(middle - extent / 2), 0, whole - extent).astype(int)
+    width, height = extent.astype(int)
+    image = image[first[1] : first[1] + height, first[0] : first[0] + width]
+    share = min(size_px[0] / width, size_px[1] / height)
+    inner = (max(1, round(share * width)), max(1, round(share * height)))
+    matrix = hull.views.img_from_local[camera].copy()
+    matrix[:2] -= first[:, None] * matrix[2]
+    view = view_of_matrix(matrix, extent, hull.views.origin_world, (1e-3, 1e6))
+    seen = [
+        *vertices,
+        *_box_corners(cells.box_local(), hull.views.origin_world, len(cells)),
+    ]
+    depths = np.concatenate(seen) if seen else np.zeros((0, 3))
+    depths_m = (depths - view.eye_world) @ view.forward
+    farthest = float(depths_m.max(initial=1.0)) * 1.05
+    nearest = float(depths_m[depths_m > 0].min(initial=farthest))
+    view = replace(view, range_m=(max(0.5 * nearest, 1e-4 * farthest), farthest))
+    floor = floor_under(np.zeros((0, 3)), np.array([0.0, 0.0, 1.0]))
+    scene = PaintedScene(hull, cells, objects, (), 1.0, floor, marks or Marks(), backdrop=image)
+    drawn = painter.paint(scene, view, inner)
+    result = np.zeros((size_px[1], size_px[0], 3), np.uint8)
+    left, top = (size_px[0] - inner[0]) // 2, (size_px[1] - inner[1]) // 2
+    result[top : top + inner[1], left : left + inner[0]] = drawn
+    labels = Labels(result, size_px[1] / 1000)
+    _write_text(labels, title, caption, scene)
+    if heat is not None:
+        labels.reserve(draw_heat(result, heat, labels.scale))
+    _label_measures(labels, scene, view, inner, np.array([left, top]))
+    return result
+
+
 def draw_overlay(
     image: Image,
     camera: Camera,
     mask: NDArray[np.uint8],
     objects: list[DrawnObject],
     *,
+    hull_depth_m: NDArray[np.float32] | None = None,
+    measures: tuple[Measure, ...] = (),
+    share: float = 1.0,
     painter: Painter | None = None,
 ) -> Image:
     """Return a camera's frame with the silhouette outlined and the CAD drawn over it.
 
     The CAD goes through the camera's lens as the world did, so that it lies where it would have
-    been seen; what of it is touched is red.
+    been seen; what of it is touched is red, what the hull hides is faint.
 
     Parameters
     ----------
@@ -213,6 +330,12 @@ def draw_overlay(
         The silhouette in the image as recorded, above 0 on object pixels.
     objects : list of DrawnObject
         What is drawn over it.
+    hull_depth_m : (H, W) float32, optional
+        How deep the hull is in the image, metres; inf where it is not.
+    measures : tuple of Measure
+        Lines with numbers.
+    share : float
+        How large the picture is beside the frame, at most 1.
     painter : Painter, optional
         Draws it; for many pictures make one and keep it.
 
@@ -234,10 +357,44 @@ def draw_overlay(
             f"camera {camera.name}: image {image.shape} and mask {mask.shape}, expected "
             f"{(*size, 3)} and {size}"
         )
+    over = Overlay(objects, hull_depth_m, measures, share)
     if painter is None:
         with Painter() as own:
-            return overlay_picture(own.device, image, camera, mask, objects)
-    return overlay_picture(painter.device, image, camera, mask, objects)
+            return overlay_picture(own.device, image, camera, mask, over)
+    return overlay_picture(painter.device, image, camera, mask, over)
+
+
+def sheet_layout(sizes_px: list[tuple[int, int]], most_px: tuple[int, int]) -> tuple[int, float]:
+    """Return in how many columns pictures fit best on a sheet, and how large they are then.
+
+    Parameters
+    ----------
+    sizes_px : list of tuple of int
+        Widths and heights; at least one.
+    most_px : tuple of int
+        Width and height that the sheet must not exceed.
+
+    Returns
+    -------
+    columns : int
+        Those with which the pictures are largest; of equals the fewest, two at least.
+    share : float
+        Of the pictures' own size, at most 1.
+    """
+    width = max(size[0] for size in sizes_px)
+    height = max(size[1] for size in sizes_px)
+    count, gap = len(sizes_px), _SHEET_GAP_PX
+    best = (0.0, 0)
+    for columns in range(1, count + 1):
+        rows = -(-count // columns)
+        share = min(
+            (most_px[0] - gap * (columns + 1)) / (columns * width),
+            (most_px[1] - gap * (rows + 1)) / (rows * height),
+            1.0,
+        )
+        if columns >= min(2, count) and share > best[0] * (1 + 1e-9):
+            best = (share, columns)
+    return best[1], best[0]
 
 
 def contact_sheet(images: list[Image], columns: int) -> Image:
@@ -347,20 +504,20 @@ def _write_text(labels: Labels, title: str, caption: str, scene: PaintedScene) -
 
     objects = scene.objects
     entries: list[tuple[str, Rgb, str]] = []
-    if len(scene.cells):
+    if len(scene.cells) and len(scene.images) == 0 and scene.backdrop is None:
         entries.append(("patch", HULL_RGB, "real: visual hull"))
-    if any(not item.collides for item in objects):
+    if any(not item.collides and item.warmth is None for item in objects):
         entries.append(("patch", FREE_RGB, "CAD, free"))
     if any(item.collides for item in objects):
-        entries.append(("patch", COLLIDING_RGB, "CAD, collides"))
-        entries.append(("patch", TOUCHED_RGB, "touched triangle"))
+        if any(item.collides and item.warmth is None for item in objects):
+            entries.append(("patch", COLLIDING_RGB, "CAD, collides"))
+            entries.append(("patch", TOUCHED_RGB, "touched triangle"))
         entries.append(("patch", INSIDE_RGB, "inside the hull"))
     if any(item.collides and len(item.hit_points_world) for item in objects):
         entries.append(("dot", POINT_RGB, "collision point"))
     bottom = height - round(24 * scale)
     if entries:
         labels.reserve(draw_legend(image, entries, left, bottom, scale))
-    _write_corner(labels, _grid_text(scene))
 
 
 def _write_corner(labels: Labels, text: str) -> None:
@@ -399,6 +556,7 @@ def _label_scene(
     labels: Labels, scene: PaintedScene, view: NovelView, size_px: tuple[int, int]
 ) -> None:
     """Name the objects, what collides first, then the cameras and the axes."""
+    _label_measures(labels, scene, view, size_px, np.zeros(2))
     ordered = sorted(scene.objects, key=lambda item: not item.collides)
     around = np.concatenate(
         [scene.cells.centers_local + scene.hull.views.origin_world, surface_samples(scene.objects)]
@@ -410,6 +568,20 @@ def _label_scene(
     tips, _ = view.pixels(np.eye(3) * scene.floor.grid_m, size_px)
     for axis, tip in enumerate(tips):
         labels.add("XYZ"[axis], tip, AXIS_RGB[axis], bold=True)
+
+
+def _label_measures(
+    labels: Labels,
+    scene: PaintedScene,
+    view: NovelView,
+    size_px: tuple[int, int],
+    off_px: NDArray[np.float64] | NDArray[np.int64],
+) -> None:
+    """Write the numbers of lines at their middles, in a picture that lies `off_px` in another."""
+    for measure in scene.marks.measures:
+        if measure.text:
+            pixels, _ = view.pixels(measure.middle_world[None], size_px)
+            labels.add(measure.text, pixels[0] + off_px, measure.rgb, bold=True)
 
 
 def _top(
@@ -441,6 +613,16 @@ def _label_cameras(
         labels.add(camera.name, pixels[0])
 
 
+def _overlaps(first: Box, second: Box) -> bool:
+    """Tell whether two rectangles have a pixel in common."""
+    return (
+        first[0] < second[2]
+        and second[0] < first[2]
+        and first[1] < second[3]
+        and second[1] < first[3]
+    )
+
+
 def _put_inset(labels: Labels, inset: Image, pixels: NDArray[np.float64]) -> Box:
     """Lay a small picture into the corner where it hides the fewest of the scene's pixels (N, 2).
 
@@ -461,7 +643,11 @@ def _put_inset(labels: Labels, inset: Image, pixels: NDArray[np.float64]) -> Box
         int(((pixels >= corner) & (pixels < (corner[0] + width, corner[1] + height))).all(1).sum())
         for corner in corners
     ]
-    left, top = corners[int(np.argmin(hidden))]
+    taken = [
+        sum(_overlaps((left, top, left + width, top + height), box) for box in labels.taken)
+        for left, top in corners
+    ]
+    left, top = corners[int(np.lexsort((hidden, taken))[0])]
     image[top : top + height, left : left + width] = inset
     frame = (left - 1, top - 1), (left + width, top + height)
     cv2.rectangle(image, *frame, (255, 255, 255), 3)

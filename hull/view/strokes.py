@@ -103,8 +103,7 @@ class Strokes:
         )
 
     def _ndc(self, points_view: NDArray[np.float64]) -> NDArray[np.float64]:
-        away = 1.0 if self.view.parallel else points_view[:, 2:]
-        return np.asarray(points_view[:, :2] / away / self.view.half_extent)
+        return self.view.places(points_view)
 
     def _add_quads(
         self,

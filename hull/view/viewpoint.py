@@ -1,10 +1,11 @@
 """From where to look: the view that shows what touched what."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.pose import rotation_of
 from hybridve.calib.rig import Rig
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import Cells, hull_cells
@@ -72,6 +73,49 @@ class Viewpoint:
         return NovelView(self.eye_world, right, down, forward, half_extent, range_m)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Focus:
+    """What a picture is about, where that is not all of the scene.
+
+    Attributes
+    ----------
+    points_world : (N, 3) float64
+        What fills it, metres; at least one.
+    names : tuple of str
+        The objects that must be seen.
+    """
+
+    points_world: NDArray[np.float64]
+    names: tuple[str, ...]
+
+
+def zoomed(
+    viewpoint: Viewpoint, factor: float, at_world: NDArray[np.float64] | None = None
+) -> Viewpoint:
+    """Return the view from the same place, so many times as large.
+
+    Parameters
+    ----------
+    viewpoint : Viewpoint
+        The view.
+    factor : float
+        Above 1 less is seen, larger.
+    at_world : (3,) float64, optional
+        What comes into the middle of the picture; by default what is there.
+    """
+    tangent = np.tan(np.deg2rad(viewpoint.vertical_fov_deg) / 2) / factor
+    fov_deg = float(np.rad2deg(2 * np.arctan(tangent)))
+    target = viewpoint.target_world if at_world is None else at_world
+    return replace(viewpoint, target_world=target, vertical_fov_deg=fov_deg)
+
+
+def orbited(viewpoint: Viewpoint, angle_rad: float) -> Viewpoint:
+    """Return a view turned about the vertical through its target, seen from above leftward."""
+    up = viewpoint.up_world / np.linalg.norm(viewpoint.up_world)
+    turned = rotation_of(angle_rad * up) @ (viewpoint.eye_world - viewpoint.target_world)
+    return replace(viewpoint, eye_world=viewpoint.target_world + turned)
+
+
 def up_axis(rig: Rig) -> NDArray[np.float64]:
     """Return the world axis that is up: Z, unless the cameras clearly stand otherwise.
 
@@ -136,7 +180,12 @@ def fitting_eye(
 
 
 def choose_viewpoint(
-    hull: Hull, rig: Rig, objects: list[DrawnObject], *, aspect: float = 1.6
+    hull: Hull,
+    rig: Rig,
+    objects: list[DrawnObject],
+    *,
+    aspect: float = 1.6,
+    focus: Focus | None = None,
 ) -> Viewpoint:
     """Return a view from above in which hull and objects fill the picture and the collision shows.
 
@@ -154,14 +203,21 @@ def choose_viewpoint(
         What else is drawn.
     aspect : float
         Width of the picture over its height.
+    focus : Focus, optional
+        What the picture is about, if not about all; cameras then do not matter.
     """
     vertices = [item.vertices_world for item in objects]
     cells = hull_cells(hull, np.concatenate(vertices) if vertices else None)
-    return viewpoint_for(hull, cells, rig, objects, aspect)
+    return viewpoint_for(hull, cells, rig, objects, aspect, focus)
 
 
 def viewpoint_for(
-    hull: Hull, cells: Cells, rig: Rig, objects: list[DrawnObject], aspect: float
+    hull: Hull,
+    cells: Cells,
+    rig: Rig,
+    objects: list[DrawnObject],
+    aspect: float,
+    focus: Focus | None = None,
 ) -> Viewpoint:
     """Return what `choose_viewpoint` does, of a hull whose cells are known."""
     up = up_axis(rig)
@@ -176,9 +232,14 @@ def viewpoint_for(
     best, best_score = None, -np.inf
     hull_points = cells.centers_local + hull.views.origin_world
     samples, hits = surface_samples(objects), _hits(objects)
+    others = [origin, centers]
+    if focus is not None:
+        wanted = [item for item in objects if item.name in focus.names]
+        points, others = focus.points_world, []
+        hits = np.concatenate([_hits(wanted), surface_samples(wanted)[:_N_HITS]])
     for forward in _directions(up):
         axes = _axes(forward, up)
-        eye = _eye([points, origin, centers], axes, half_extent)
+        eye = _eye([points, *others], axes, half_extent)
         view = NovelView(eye, *axes, half_extent, (1e-3, np.inf))
         score = _score(view, hull_points, samples, hits, centers)
         if score > best_score:
@@ -239,7 +300,7 @@ def _eye(
     shown = points[0]
     eye = fitting_eye(shown, axes, _FILL * half_extent)
     near_m = float(np.median((shown - eye) @ axes[2]))
-    for more, cost in zip(points[1:], (_ORIGIN_MAY_COST, _CAMERAS_MAY_COST), strict=True):
+    for more, cost in zip(points[1:], (_ORIGIN_MAY_COST, _CAMERAS_MAY_COST), strict=False):
         wider = np.concatenate([shown, more])
         far = fitting_eye(wider, axes, _FILL * half_extent)
         if float(np.median((points[0] - far) @ axes[2])) <= cost * near_m:

@@ -17,6 +17,10 @@
 // | unit 6  | hit_depth   | sampler2D | nearest part of an object inside the hull                |
 // | unit 7  | hit_normal  | sampler2D | local frame                                              |
 // | unit 8  | shade_map   | sampler2D | darkness of the floor, 0 to 1, over floor_low..floor_high |
+// | unit 9  | skin_map    | sampler2D | with has_skin the hull's colour; w = 0 where nobody saw   |
+// |         |             |           | it                                                        |
+// | unit 10 | backdrop    | sampler2D | with has_backdrop what the camera recorded, all over the  |
+// |         |             |           | picture                                                   |
 //
 // Colours are sRGB in and out; light adds up in linear values.
 
@@ -29,6 +33,8 @@ layout(binding = 5) uniform sampler2D mesh_normal;
 layout(binding = 6) uniform sampler2D hit_depth;
 layout(binding = 7) uniform sampler2D hit_normal;
 layout(binding = 8) uniform sampler2D shade_map;
+layout(binding = 9) uniform sampler2D skin_map;
+layout(binding = 10) uniform sampler2D backdrop;
 
 uniform vec3 eye;            // as in novel.frag.glsl
 uniform vec3 right, down, forward;
@@ -46,10 +52,17 @@ uniform bool has_floor;
 
 uniform vec3 hull_colour, free_colour, colliding_colour, touched_colour, inside_colour;
 
+uniform bool has_skin;       // the hull is drawn as it looked, and nothing shines through but hits
+uniform bool has_backdrop;   // the scene lies over a recorded picture, the hull as it is in it
+uniform vec3 heat_colours[6];  // from far to near
+
+const float HEATED = 5.0;    // the same in mesh.frag.glsl
+
 const float NEVER = 3.0e38;
 const float FAR = 1.0e38;
 const float SHARP_EDGE = 0.86;  // cosine between the normals on either side of a drawn edge
 const int OCCLUSION_TAPS = 8;
+const vec3 OUTLINE = vec3(0.10, 0.95, 0.75);  // of the hull in a recorded picture
 const float DARK = 0.55;        // of a colour where no lamp of the scene reaches
 
 // A square stands for sRGB's curve: near enough for a drawing, and quick in software.
@@ -71,6 +84,11 @@ vec3 lit(vec3 base, vec3 n, float open) {
 }
 
 vec3 base_of(float kind) {
+    if (kind >= HEATED) {
+        float at = 5.0 * (kind - HEATED);
+        int below = int(min(floor(at), 4.0));
+        return mix(heat_colours[below], heat_colours[below + 1], at - float(below));
+    }
     if (kind > 3.5) return inside_colour;
     float bright = mix(1.0, DARK, clamp(fract(kind) / 0.4, 0.0, 1.0));
     if (kind > 2.5) return bright * touched_colour;
@@ -93,6 +111,20 @@ float edge(sampler2D depths, sampler2D normals, ivec2 here, float own_depth) {
         if (min(dot(own, na), dot(own, nb)) < SHARP_EDGE) strength = max(strength, 0.7);
     }
     return strength;
+}
+
+// Whether the hull ends beside this pixel.
+float step_off(ivec2 here) {
+    ivec2 last = ivec2(size_px) - 1;
+    int reach = int(edge_px);
+    float ends = 0.0;
+    for (int k = 0; k < 4; ++k) {
+        ivec2 off = reach * ivec2(k == 0 ? 1 : k == 1 ? -1 : 0, k == 2 ? 1 : k == 3 ? -1 : 0);
+        ivec2 there = here + off;
+        if (any(lessThan(there, ivec2(0))) || any(greaterThan(there, last))) continue;
+        if (texelFetch(hull_depth, there, 0).r > FAR) ends = 1.0;
+    }
+    return ends;
 }
 
 // The share of the surroundings that is open, from what rises above the surface around.
@@ -134,6 +166,8 @@ void main() {
     float scene_z = min(hull_z, mesh_z);
 
     vec3 light = mix(linear(vec3(0.985)), linear(vec3(0.905, 0.915, 0.93)), gl_FragCoord.y / size_px.y);
+    if (has_backdrop) light = linear(texelFetch(backdrop, here, 0).rgb);
+    vec3 behind = light;
     vec4 floor_light = vec4(0.0);
     float floor_z = NEVER;
     float slope = dot(direction, up);
@@ -173,16 +207,26 @@ void main() {
         }
         if (hull_z < mesh_z) {
             vec3 skin = lit(hull_colour, front, open);
-            if (mesh_z < FAR) skin = mix(skin, body, kind > 1.5 ? 0.30 : 0.12);
+            float through = kind > 1.5 && kind < HEATED ? 0.30 : 0.12;
+            if (has_skin) {
+                vec4 seen = texelFetch(skin_map, here, 0);
+                skin = mix(skin, linear(seen.rgb), seen.w);
+                through *= 0.4;
+            }
+            if (has_backdrop) {
+                skin = mix(behind, linear(OUTLINE), 0.8 * step_off(here));
+                through *= 0.4;
+            }
+            if (mesh_z < FAR) skin = mix(skin, body, through);
             light = skin;
         } else {
-            light = body;
+            light = has_backdrop ? mix(behind, body, 0.75) : body;
         }
         if (hit_z < FAR) {
             vec3 red = lit(inside_colour, texelFetch(hit_normal, here, 0).xyz, 1.0);
             // Laid over the hull it must be seen; behind CAD it must not pretend to be before it.
             bool behind_cad = mesh_z < hit_z * (1.0 - 1e-3) && mesh_z < hull_z;
-            light = mix(light, red, behind_cad ? 0.4 : 0.85);
+            light = mix(light, red, behind_cad ? 0.4 : has_skin || has_backdrop ? 0.6 : 0.85);
             light *= 1.0 - 0.35 * edge(hit_depth, hit_normal, here, hit_z);
         }
         if (floor_z < scene_z * (1.0 - 1e-3)) light = mix(light, floor_light.rgb, 0.5 * floor_light.a);

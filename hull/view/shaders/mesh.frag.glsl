@@ -16,12 +16,13 @@
 //
 // Kinds, the same in hull/view/paint.py: 1 free, 2 of an object that collides, 3 a triangle with
 // collision points, 4 inside the hull. To the first three is added up to 0.4 where lamps of the scene
-// do not reach.
+// do not reach. Where warmth is not negative, the kind is HEATED plus it instead, unless it is 4.
 
 // INSERT
 
 in vec3 mesh_point;
 flat in float mesh_kind;
+in float mesh_warmth;   // how near something came, 0 to 1; negative where that is not shown
 
 layout(location = 0) out float depth;
 layout(location = 1) out vec4 normal;
@@ -31,11 +32,14 @@ uniform bool parallel;
 uniform vec3 box_low, box_high;  // contains the hull, metres, local frame
 uniform bool inside_only;   // draw nothing but what is inside the hull
 
+const float HEATED = 5.0;   // the same in compose.frag.glsl
+
 void main() {
     float kind = mesh_kind;
     bool near_hull = all(greaterThan(mesh_point, box_low)) && all(lessThan(mesh_point, box_high));
     if (kind > 1.5 && near_hull && hull_contains(mesh_point)) kind = 4.0;
     if (inside_only && kind < 3.5) discard;
+    if (kind < 3.5 && mesh_warmth >= 0.0) kind = HEATED + clamp(mesh_warmth, 0.0, 0.995);
 
     vec3 across = cross(dFdx(mesh_point), dFdy(mesh_point));
     float size = length(across);
