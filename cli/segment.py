@@ -1,13 +1,19 @@
-"""``hybridve segment``: silhouettes of a recording, stored beside the session."""
+"""``hybridve segment``: silhouettes of a recording, stored, and how good they are."""
 
 import json
-from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hybridve.cli import options
 from hybridve.cli.progress import Terminal
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hybridve.hull.cut_out import Segmented
+    from hybridve.hull.quality import Scored
 
 
 @click.command(short_help="Cut the real things out of the recording.")
@@ -18,12 +24,41 @@ from hybridve.cli.progress import Terminal
     help="Keep pieces that no other camera confirms. By default they are dropped where the session "
     "has a rig; the hull is the same either way.",
 )
+@click.option(
+    "--page/--no-page",
+    default=True,
+    help="Write silhouettes.html beside them: frames to look at first, curves, pictures. The "
+    "default.",
+)
+@click.option(
+    "--film",
+    type=click.Path(path_type=Path),
+    metavar="OUT.mp4",
+    help="A film of what all cameras saw, with outlines.",
+)
+@click.option(
+    "--evaluate",
+    metavar="MASKS",
+    help="Score the silhouettes against masks made by hand: a path with {camera} (its name) or "
+    "{number} (1, 2, ...) and {frame} (the number of the picture; without it frame 0).",
+)
+@click.option(
+    "--ignore",
+    "ignored",
+    type=click.IntRange(0, 255),
+    multiple=True,
+    help="With --evaluate: a grey level of MASKS whose pixels do not count. May be repeated.",
+)
 @options.overwrite_option
 @options.json_option
 @options.quiet_progress
 def segment(
     session: Path,
     unconfirmed: bool,
+    page: bool,
+    film: Path | None,
+    evaluate: str | None,
+    ignored: tuple[int, ...],
     overwrite: bool,
     as_json: bool,
     progress: bool,
@@ -32,100 +67,144 @@ def segment(
 
     They are kept in silhouettes.h5 beside the session.toml; detect takes them from there as long
     as neither the recordings nor the settings nor the rig change. Without this command, detect cuts
-    them out as it goes.
+    them out as it goes. Beside them silhouettes.html tells how good they are.
 
     \b
     Example:
-      hybridve segment my_session
+      hybridve segment my_session --film outlines.mp4
+      hybridve segment my_session --evaluate 'by_hand/{camera}/{frame}.png'
     """
     import cv2
 
     from hybridve.calib.errors import ask_all
-    from hybridve.calib.plain import to_json
-    from hybridve.hull.agreement.blank import BlankLooks
-    from hybridve.hull.agreement.record import SessionAgreement
     from hybridve.hull.capture.inspection import opened_session
-    from hybridve.hull.capture.recording import (
-        FrameRange,
-        check_lengths,
-        claimed_length,
-        recorded_sizes,
-        segmented_frames,
-        silhouette_stamp,
-    )
-    from hybridve.hull.capture.rig import has_rig, load_rig, rig_digest
-    from hybridve.hull.capture.room_check import check_room
-    from hybridve.hull.capture.silhouette_io import SilhouetteWriter
-    from hybridve.hull.report.write import refuse_existing_in
-    from hybridve.hull.trust import Desk, blank_causes
+    from hybridve.hull.capture.scoring import find_hand_masks
+    from hybridve.hull.cut_out import segment_session
+    from hybridve.hull.quality import score_silhouettes, write_outline_film, write_page
+    from hybridve.hull.report.write import refuse_existing, refuse_existing_in
+    from hybridve.hull.view.film import refuse_no_film
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
     terminal = Terminal(enabled=progress)
+    if ignored and evaluate is None:
+        raise click.UsageError("--ignore goes with --evaluate")
     folder = session if session.is_dir() else session.parent
     output = folder / "silhouettes.h5"
-    loaded, _ = ask_all(
+    loaded, *_ = ask_all(
         lambda: opened_session(session),
         lambda: refuse_existing_in(folder, output.name, overwrite=overwrite),
+        *([] if film is None else [lambda: refuse_no_film(film)]),
+        *([] if film is None else [lambda: refuse_existing(film, overwrite=overwrite)]),
     )
-    sizes_px = recorded_sizes(loaded)
-    check_lengths(loaded, FrameRange())
-    digest, desk = None, None
-    if not unconfirmed and has_rig(loaded):
-        rig = load_rig(loaded, terminal.stage)
-        room = check_room(loaded, rig, terminal.stage)  # said before the work, and once
-        digest, desk = rig_digest(rig), Desk.of(loaded, rig, room)
-
-    names = [camera.name for camera in loaded.cameras]
-    looks = BlankLooks()
-    n_frames, n_invalid = 0, 0
-    recording = segmented_frames(loaded, FrameRange(), progress=terminal.stage)
-    with (
-        closing(recording) as frames,
-        SilhouetteWriter(output, names, sizes_px, silhouette_stamp(loaded, digest)) as writer,
-        terminal.steps("segment", claimed_length(loaded)) as advance,
-    ):
-        for frame in frames:
-            masks = frame.masks
-            if desk is not None:
-                masks = desk.take(frame.index, masks)
-            writer.append(masks, frame.reason)
-            n_frames += 1
-            if masks is None:
-                n_invalid += 1
-            else:
-                looks.take(frame.index, masks)
-            advance()
-    agreement = SessionAgreement()
-    if desk is not None:
-        agreement = desk.judge()
-    elif looks.index:
-        span = (looks.index[0], looks.index[-1])
-        causes = blank_causes(loaded, looks.shares, looks.is_same, span)
-        agreement = SessionAgreement(causes=causes)
-    means = looks.shares.mean(axis=0).tolist() if looks.index else [0.0] * len(names)
-    shares = dict(zip(names, means, strict=True))
+    if evaluate is not None:
+        find_hand_masks(loaded, evaluate)  # said before the work
+    found = segment_session(loaded, output, terminal, unconfirmed=unconfirmed)
+    n_looks = None
+    html = output.with_suffix(".html")
+    if page:
+        n_looks = write_page(html, loaded, found)
+    else:
+        html.unlink(missing_ok=True)  # one of other silhouettes would be believed
+    if film is not None:
+        write_outline_film(film, loaded, found, terminal)
+    scored = score_silhouettes(loaded, output, evaluate, ignored) if evaluate is not None else []
     if as_json:
-        click.echo(
-            json.dumps(
-                {
-                    "silhouettes": str(output),
-                    "frames": n_frames,
-                    "frames_invalid": n_invalid,
-                    "unconfirmed_dropped": desk is not None,
-                    "trusted": agreement.is_trusted,
-                    "causes": to_json(agreement.causes),
-                    "mean_object_share": shares,
-                    "bytes": output.stat().st_size,
-                }
-            )
-        )
-        return
+        _print_json(found, html if page else None, n_looks, film, scored)
+    else:
+        _print(found, html if page else None, n_looks, film)
+        _print_scores(scored)
+
+
+def _shares(found: "Segmented") -> dict[str, float]:
+    """Return the share of each camera's pictures that is object, on average."""
+    import numpy as np
+
+    read = [not why for why in found.reasons]
+    means = found.shares[read].mean(axis=0) if any(read) else np.zeros(len(found.names))
+    return dict(zip(found.names, means.tolist(), strict=True))
+
+
+def _print_json(
+    found: "Segmented",
+    page: Path | None,
+    n_looks: int | None,
+    film: Path | None,
+    scored: "Sequence[Scored]",
+) -> None:
+    from hybridve.calib.plain import to_json
+
+    told: dict[str, Any] = {
+        "silhouettes": str(found.path),
+        "frames": len(found.reasons),
+        "frames_invalid": sum(bool(why) for why in found.reasons),
+        "unconfirmed_dropped": found.is_confirmed,
+        "trusted": found.agreement.is_trusted,
+        "causes": to_json(found.agreement.causes),
+        "mean_object_share": _shares(found),
+        "bytes": found.path.stat().st_size,
+        "page": None if page is None else str(page),
+        "frames_to_look_at": n_looks,
+        "film": None if film is None else str(film),
+    }
+    if scored:
+        told["masks"] = [
+            {"camera": one.camera, "frame": one.frame, "mask": str(one.path), **_numbers(one)}
+            for one in scored
+        ]
+        told["scores"] = {name: _numbers(one) for name, one in _by_camera(scored).items()} | {
+            "mean_iou": sum(one.score.iou for one in scored) / len(scored)
+        }
+    click.echo(json.dumps(told))
+
+
+def _print(found: "Segmented", page: Path | None, n_looks: int | None, film: Path | None) -> None:
+    n_invalid = sum(bool(why) for why in found.reasons)
     click.echo(
-        f"{output}: {n_frames} frames, {n_invalid} without all cameras, "
-        f"{output.stat().st_size / 1e6:.1f} MB"
+        f"{found.path}: {len(found.reasons)} frames, {n_invalid} without all cameras, "
+        f"{found.path.stat().st_size / 1e6:.1f} MB"
     )
-    for name, share in shares.items():
+    for name, share in _shares(found).items():
         click.echo(f"  {name}: {share:.1%} of the picture is object, on average")
-    trust = "" if agreement.is_trusted else "not to be trusted: "
-    for cause in agreement.causes:
+    trust = "" if found.agreement.is_trusted else "not to be trusted: "
+    for cause in found.agreement.causes:
         click.echo(f"  {trust if cause.is_gross else ''}{cause.message}")
+    if page is not None:
+        first = f": {n_looks} frames to look at first" if n_looks else ""
+        click.echo(f"{page}{first}")
+    if film is not None:
+        click.echo(f"{film}")
+
+
+def _by_camera(scored: "Sequence[Scored]") -> dict[str, "Scored"]:
+    """Return the scores of each camera's masks together, and of all where there are several."""
+    from dataclasses import replace
+
+    from hybridve.hull.capture.scoring import Score
+
+    names = dict.fromkeys(one.camera for one in scored)
+    groups = {name: [one for one in scored if one.camera == name] for name in names}
+    if len(groups) > 1:
+        groups["all"] = list(scored)
+    return {
+        name: replace(group[0], score=Score.total(one.score for one in group))
+        for name, group in groups.items()
+    }
+
+
+def _numbers(one: "Scored") -> dict[str, float]:
+    score = one.score
+    return {"iou": score.iou, "f1": score.f1, "precision": score.precision, "recall": score.recall}
+
+
+def _print_scores(scored: "Sequence[Scored]") -> None:
+    if not scored:
+        return
+    click.echo(f"against {len(scored)} masks made by hand:")
+    for name, one in _by_camera(scored).items():
+        score = one.score
+        click.echo(
+            f"  {name}: IoU {score.iou:.3f}, F1 {score.f1:.3f}, precision {score.precision:.3f}, "
+            f"recall {score.recall:.3f}"
+        )
+    mean = sum(one.score.iou for one in scored) / len(scored)
+    click.echo(f"  mean IoU of the masks: {mean:.3f}")

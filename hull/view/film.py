@@ -17,6 +17,18 @@ FILMS = (".mp4",)
 _QUALITY = "21"
 
 
+def refuse_no_film(path: Path) -> None:
+    """Refuse a name that no film is written under.
+
+    Raises
+    ------
+    ReportError
+        Saying what is written.
+    """
+    if path.suffix.lower() not in FILMS:
+        raise ReportError(f"{path}: films are written as {', '.join(FILMS)}")
+
+
 def write_film(path: Path, images: Iterable[NDArray[np.uint8]], fps: float) -> int:
     """Write pictures (H, W, 3) BGR of one size as a film, and return how many they were.
 
