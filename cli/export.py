@@ -42,6 +42,12 @@ _path = click.Path(path_type=Path)
     "clash); or a .csv for the first, beside which FILE.clashes.csv is put.",
 )
 @click.option(
+    "--bcf",
+    type=_path,
+    help="The clashes for BIM tools, BCF 3.0: a topic each, with its status, a picture and from "
+    "where it is seen. A clash has the same identity in every file.",
+)
+@click.option(
     "--hull-mesh",
     type=_path,
     help="A folder for the hull of each frame as a closed mesh; of --session.",
@@ -86,6 +92,7 @@ def export(
     report: Path | None,
     html: Path | None,
     csv: Path | None,
+    bcf: Path | None,
     hull_mesh: Path | None,
     mesh_format: str,
     cell_mm: float,
@@ -111,14 +118,14 @@ def export(
         return
     if report is None:
         raise click.UsageError("name the report to export")
-    targets = (html, csv, hull_mesh, vtk)
+    targets = (html, csv, bcf, hull_mesh, vtk)
     if all(one is None for one in targets):
         raise click.UsageError("say as what: " + ", ".join(one[0] for one in _TARGETS))
-    _refuse_wrong_usage(html, hull_mesh, vtk, session)
+    _refuse_wrong_usage(html, bcf, hull_mesh, vtk, session)
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.write import refuse_existing
 
-    for path in (html, vtk):
+    for path in (html, bcf, vtk):
         if path is not None:
             refuse_existing(path, overwrite=overwrite)
     tables = None if csv is None else _table_paths(csv, overwrite=overwrite)
@@ -131,10 +138,16 @@ def export(
         raise ReportError(f"{report}: has no frames to export")
     terminal = Terminal(enabled=progress)
     recorded, missing = _recorded(loaded, session, terminal)
-    if html is not None or tables is not None:
+    if any(one is not None for one in (html, tables, bcf)):
         found, listed = _clashes(loaded, ledger_file)
     if tables is not None:
         _write_tables(*tables, loaded, listed)
+    if bcf is not None:
+        from hybridve.hull.export_bcf import write_clashes_bcf
+
+        why = write_clashes_bcf(bcf, loaded, listed, recorded=recorded, progress=terminal.stage)
+        without = f", without pictures: {why}" if why else ""
+        click.echo(f"{bcf}: {options.counted(len(listed), 'topic')}{without}")
     if hull_mesh is not None:
         from hybridve.hull.export_hulls import write_hull_meshes
 
@@ -173,17 +186,25 @@ def export(
 
 
 def _refuse_wrong_usage(
-    html: Path | None, hull_mesh: Path | None, vtk: Path | None, session: Path | None
+    html: Path | None,
+    bcf: Path | None,
+    hull_mesh: Path | None,
+    vtk: Path | None,
+    session: Path | None,
 ) -> None:
     """Refuse names that say of nothing that can be written, and options that need each other."""
     if html is not None and html.suffix.lower() not in (".html", ".htm"):
         raise click.UsageError(f"{html}: pages are .html")
     if vtk is not None and vtk.suffix.lower() != ".vtkhdf":
         raise click.UsageError(f"{vtk}: files for ParaView are .vtkhdf")
+    if bcf is not None and bcf.suffix.lower() not in (".bcf", ".bcfzip"):
+        raise click.UsageError(f"{bcf}: BCF files are .bcf or .bcfzip")
     if hull_mesh is not None and session is None:
         raise click.UsageError("--hull-mesh needs --session SESSION: a report holds no hull")
-    if session is not None and html is None and hull_mesh is None and vtk is None:
-        raise click.UsageError("--session is of --html, --hull-mesh and --vtk; give one of them")
+    if session is not None and all(one is None for one in (html, bcf, hull_mesh, vtk)):
+        raise click.UsageError(
+            "--session is of --html, --bcf, --hull-mesh and --vtk; give one of them"
+        )
 
 
 def _refuse_meshes(folder: Path, suffix: str, *, overwrite: bool) -> None:

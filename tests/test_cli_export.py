@@ -1,10 +1,14 @@
 """``hybridve export``: what other programs make of a report."""
 
 import json
+import math
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -222,6 +226,82 @@ def test_cells_that_memory_cannot_hold_are_refused_with_what_it_can(
     assert len(line.splitlines()) == 1
 
 
+# --- BCF ----------------------------------------------------------------------------------------
+
+
+def topics_of(path: Path) -> dict[str, dict[str, ElementTree.Element]]:
+    """What the topics of a BCF file are, by their folders: markup and viewpoint."""
+    found: dict[str, dict[str, ElementTree.Element]] = {}
+    with zipfile.ZipFile(path) as file:
+        assert file.testzip() is None
+        version = ElementTree.fromstring(file.read("bcf.version"))
+        assert (version.tag, version.attrib) == ("Version", {"VersionId": "3.0"})
+        for name in file.namelist():
+            folder, _, rest = name.rpartition("/")
+            if rest in ("markup.bcf", "viewpoint.bcfv"):
+                found.setdefault(folder, {})[rest] = ElementTree.fromstring(file.read(name))
+            elif rest == "snapshot.png":
+                image = cv2.imdecode(np.frombuffer(file.read(name), np.uint8), cv2.IMREAD_COLOR)
+                assert image is not None
+    return found
+
+
+def vector_of(parent: ElementTree.Element, path: str) -> list[float]:
+    return [float(str(parent.findtext(f"{path}/{axis}"))) for axis in "XYZ"]
+
+
+def test_bcf_has_a_topic_a_clash_seen_from_where_its_picture_is(
+    run: Run, ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "clashes.bcf"
+    call = ("--bcf", path, "--session", ball, "--no-progress")
+    capsys.readouterr()
+    assert run("export", ball / "report.h5", *call) == 0
+    assert capsys.readouterr().out == f"{path}: 1 topic\n"
+    run("clashes", ball / "report.h5", "--json")
+    (told,) = json.loads(capsys.readouterr().out)["clashes"]
+
+    ((folder, parts),) = topics_of(path).items()
+    topic = parts["markup.bcf"].find("Topic")
+    assert topic is not None
+    assert topic.attrib["Guid"] == folder
+    assert topic.attrib["ServerAssignedId"] == told["id"]
+    assert topic.attrib["TopicStatus"] == told["status"]
+    view = parts["viewpoint.bcfv"]
+    eye, way = (
+        np.array(vector_of(view, f"PerspectiveCamera/{name}"))
+        for name in ("CameraViewPoint", "CameraDirection")
+    )
+    assert abs(np.linalg.norm(way) - 1.0) < 1e-9
+    at = np.array(told["worst"]["on_object_m"]) - eye
+    half = math.radians(0.5 * float(str(view.findtext("PerspectiveCamera/FieldOfView"))))
+    assert way @ at / np.linalg.norm(at) > math.cos(1.5 * half)  # the clash is in the picture
+    np.testing.assert_allclose(
+        vector_of(view, "Lines/Line/StartPoint"), told["worst"]["on_object_m"]
+    )
+
+
+def test_a_clash_has_the_same_identity_in_every_bcf_and_what_was_decided(
+    run: Run, report: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("export", report, "--bcf", tmp_path / "1.bcf")
+    assert "without pictures: the report holds no meshes, or no rig" in capsys.readouterr().out
+    first = topics_of(tmp_path / "1.bcf")
+    topic = next(iter(first.values()))["markup.bcf"].find("Topic")
+    assert topic is not None
+    why = ("--comment", "a < b & \x01c", "--who", "anna")
+    assert run("clashes", report, "--approve", topic.attrib["ServerAssignedId"], *why) == 0
+    run("export", report, "--bcf", tmp_path / "2.bcf")
+    second = topics_of(tmp_path / "2.bcf")
+
+    assert list(first) == list(second)
+    topic = next(iter(second.values()))["markup.bcf"].find("Topic")
+    assert topic is not None
+    assert topic.attrib["TopicStatus"] == "approved"
+    assert topic.findtext("Comments/Comment/Comment") == "a < b & ?c"
+    assert topic.findtext("Comments/Comment/Author") == "anna"
+
+
 # --- What cannot be -----------------------------------------------------------------------------
 
 
@@ -235,9 +315,10 @@ def test_what_there_is_is_listed(run: Run, capsys: pytest.CaptureFixture[str]) -
     [
         ((), "say as what: --html"),
         (("--html", "OUT.pdf"), "OUT.pdf: pages are .html"),
+        (("--bcf", "OUT.zip"), "OUT.zip: BCF files are .bcf or .bcfzip"),
         (("--vtk", "OUT.vtk"), "OUT.vtk: files for ParaView are .vtkhdf"),
         (("--hull-mesh", "hulls"), "--hull-mesh needs --session SESSION"),
-        (("--session", "s", "--csv", "t"), "--session is of --html, --hull-mesh and --vtk"),
+        (("--session", "s", "--csv", "t"), "--session is of --html, --bcf, --hull-mesh and --vtk"),
     ],
 )
 def test_wrong_usage_is_one_line(
