@@ -6,7 +6,6 @@ larger than is wanted is left out frame by frame, evenly, and told.
 """
 
 import json
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -18,17 +17,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import CalibrationError, DeviceError, ReportError, SessionError
-from hybridve.calib.formats.rig_json import rig_from_dict
+from hybridve.calib.errors import DeviceError, ReportError, SessionError
 from hybridve.calib.lengths import bounds_mm, mm
-from hybridve.calib.lens import Undistortion, project_points, undistortion
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import FrameRange
+from hybridve.hull.clash_pictures import clash_pictures, fitted, row_of
 from hybridve.hull.contact.verdict import VERDICTS
 from hybridve.hull.curves import curve_of
-from hybridve.hull.query.silhouettes import Views, make_hull, make_views
-from hybridve.hull.recorded import Recorded, seen_frames
-from hybridve.hull.report.clashes import Clash, Clashes
+from hybridve.hull.recorded import Recorded, rig_of, seen_frames
+from hybridve.hull.report.clashes import Clashes
 from hybridve.hull.report.ledger import Listed
 from hybridve.hull.report.read import Report
 from hybridve.hull.report.summarize import summarize
@@ -41,10 +38,8 @@ from hybridve.hull.report.wording import (
     sentence,
     worst_text,
 )
-from hybridve.hull.view.drawn import DrawnObject
 from hybridve.hull.view.packed import STEP_M, packed, packed_lists, packed_surface, webp
 from hybridve.hull.view.paint import Painter, camera_length_m, floor_under
-from hybridve.hull.view.picture import draw_overlay, draw_picture
 from hybridve.hull.view.report_page import (
     ClashCard,
     Lane,
@@ -71,8 +66,8 @@ _RESERVE_BYTES = 1_500_000
 #: Pictures of the cameras: width, quality of WebP, and what one takes at most, roughly.
 _SMALL_PX, _SMALL_QUALITY = 320, 45
 
-#: Pictures of a clash: width of the first and of the others, quality, and how many cameras.
-_LARGE_PX, _OTHER_PX, _LARGE_QUALITY, _MOST_CAMERAS = 1280, 560, 72, 4
+#: Quality of pictures of a clash.
+_LARGE_QUALITY = 72
 
 #: Of more clashes than this, only the worst have pictures.
 _MOST_PICTURED = 24
@@ -85,9 +80,6 @@ _MOST_POINTS = 64
 
 #: Colour of the outline in small pictures, BGR; as in large ones.
 _OUTLINE_BGR = (191, 242, 26)
-
-#: A close-up shows this much of a picture, and at least so many metres about the clash.
-_CLOSE_SHARE = 0.34
 
 
 def write_page(
@@ -171,9 +163,13 @@ def _page(
             "Without the session there are no pictures of cameras and no hull on this page: "
             "`hybridve export ... --session SESSION` puts them in.",
         )
+    elif all(camera.has_masks for camera in recorded.session.cameras):
+        told.append(
+            "The session has ready masks and no pictures: what its cameras saw is shown as that."
+        )
     if not touched:
         told.append("The report is of version 1, which holds no meshes: there is no scene in 3D.")
-    rig = _rig_of(report, recorded)
+    rig = rig_of(report, recorded)
     if rig is None:
         told.append("The report holds no rig that can be read: no cameras are drawn.")
     scene, chunks = _scene(report, listed, origin_m, touched, rig, recorded)
@@ -364,20 +360,6 @@ def _parsed(text: Any) -> Any:
 # --- The scene ---------------------------------------------------------------------------------
 
 
-def _rig_of(report: Report, recorded: Recorded | None) -> Rig | None:
-    """Return the cameras of a report; None if it holds none that can be read."""
-    names = list(report.cameras) or list(report.settings.get("cameras", ()))
-    if recorded is not None:
-        rig = recorded.rig
-    else:
-        try:
-            rig = rig_from_dict(report.rig, f"{report.path}: rig")
-        except CalibrationError:
-            return None
-    known = {camera.name for camera in rig.cameras}
-    return rig.only([name for name in names if name in known] or sorted(known))
-
-
 def _scene(
     report: Report,
     listed: Sequence[Listed],
@@ -421,7 +403,7 @@ def _scene(
     size_m = 12 * floor.grid_m
     height_m = floor.height_m - float(origin_m @ up)
     foot = middle + (height_m - middle @ up) * up
-    first_row = _row_of(report, listed[0].clash) if listed else 0
+    first_row = row_of(report, listed[0].clash) if listed else 0
     scene: dict[str, Any] = {
         "frames": report.index.tolist(),
         "times": [round(one, 6) for one in report.time_s.tolist()],
@@ -437,7 +419,7 @@ def _scene(
         "from": _from(up, centers, middle).tolist(),
         "clashes": [
             {
-                "row": _row_of(report, one.clash),
+                "row": row_of(report, one.clash),
                 "place": (one.clash.worst.on_object_world - origin_m).tolist(),
                 "distance": max(0.6 * reach_m, 0.3),
             }
@@ -474,10 +456,6 @@ def _from(
     level = level / length if length > 1e-9 else np.roll(up, 1)
     direction = level + 0.55 * up
     return np.asarray(direction / np.linalg.norm(direction))
-
-
-def _row_of(report: Report, clash: Clash) -> int:
-    return int(np.flatnonzero(report.index == clash.worst.frame)[0])
 
 
 def _first_placed(one: Touched) -> int | None:
@@ -594,7 +572,7 @@ def _cards(
     progress: Progress | None,
 ) -> tuple[list[ClashCard], list[str]]:
     """Return the clashes as the page has them, and why some have no pictures."""
-    rig = _rig_of(report, recorded)
+    rig = rig_of(report, recorded)
     why: list[str] = []
     cards: list[ClashCard] = []
     with ExitStack() as stack:
@@ -609,12 +587,12 @@ def _cards(
             if painter is not None and rig is not None and number < _MOST_PICTURED:
                 if progress is not None:
                     progress("pictures of clashes", number, min(len(listed), _MOST_PICTURED))
-                row = _row_of(report, one.clash)
-                objects = _drawn(report, touched, origin_m, row)
-                if recorded is not None:
-                    pictures = _overlays(recorded, one.clash, objects, painter)
-                if not pictures:
-                    pictures = [_drawing(report, rig, one.clash, objects, painter)]
+                pictures = [
+                    PagePicture(webp(each.image, _LARGE_QUALITY), each.says, each.caption)
+                    for each in clash_pictures(
+                        report, one.clash, origin_m, touched, rig, recorded, painter
+                    )
+                ]
             cards.append(_card(report, one, origin_m, pictures))
     if len(listed) > _MOST_PICTURED:
         why.append(f"Pictures are of the worst {_MOST_PICTURED} clashes only.")
@@ -655,7 +633,7 @@ def _card(
         object=clash.name,
         words=_typeset(sentence(clash)),
         frame=worst.frame,
-        row=_row_of(report, clash),
+        row=row_of(report, clash),
         place_m=(x, y, z),
         facts=facts,
         pictures=pictures,
@@ -674,140 +652,6 @@ def _in_mm(text: str) -> str:
 
 def _point(values: NDArray[np.float64], digits: int) -> str:
     return f"({', '.join(f'{round(one, digits) + 0.0:.{digits}f}' for one in values.tolist())})"
-
-
-def _drawn(
-    report: Report, touched: Mapping[str, Touched], origin_m: NDArray[np.float64], row: int
-) -> list[DrawnObject]:
-    """Return the CAD as it stood in a row of the report, with what of it is touched."""
-    drawn = []
-    for name, one in touched.items():
-        vertices = one.mesh.vertices_at(row)
-        if not np.isfinite(vertices).all():
-            continue
-        triangles, offset = one.triangles()
-        drawn.append(
-            DrawnObject(
-                name=name,
-                vertices_world=vertices + origin_m,
-                faces=one.mesh.faces,
-                collides=bool(report.objects[name].collides[row]),
-                hit_triangles=triangles[offset[row] : offset[row + 1]].astype(np.uint32),
-                hit_points_world=one.points(row) + origin_m,
-            )
-        )
-    return drawn
-
-
-def _drawing(
-    report: Report, rig: Rig, clash: Clash, objects: list[DrawnObject], painter: Painter
-) -> PagePicture:
-    """Return the CAD and its collision points from outside, without a hull."""
-    views, lenses = _pinholes(rig)
-    nothing = [np.zeros((lens.height_px, lens.width_px), np.uint8) for lens in lenses]
-    alone = [one for one in objects if one.name == clash.name] or objects
-    image = draw_picture(
-        make_hull(views, nothing),
-        rig,
-        alone,
-        size_px=(_LARGE_PX, 800),
-        title=clash.name,
-        caption=f"frame {clash.worst.frame} ({clash.worst.time_s:.2f} s), without the hull",
-        painter=painter,
-    )
-    return PagePicture(
-        webp(image, _LARGE_QUALITY),
-        f"{clash.name} from outside: what of it is touched in frame {clash.worst.frame} is red.",
-        f"{report.path.name}, frame {clash.worst.frame}: CAD and collision points",
-    )
-
-
-def _pinholes(rig: Rig) -> tuple[Views, list[Undistortion]]:
-    lenses = [undistortion(camera) for camera in rig.cameras]
-    matrices = [
-        lens.img_from_cam @ camera.cam_from_world
-        for lens, camera in zip(lenses, rig.cameras, strict=True)
-    ]
-    sizes_px = np.array([(lens.width_px, lens.height_px) for lens in lenses], np.int64)
-    names = tuple(camera.name for camera in rig.cameras)
-    return make_views(names, sizes_px, np.array(matrices)), lenses
-
-
-def _overlays(
-    recorded: Recorded, clash: Clash, objects: list[DrawnObject], painter: Painter
-) -> list[PagePicture]:
-    """Return what the cameras saw in the worst frame: the closest whole, a close-up, and others."""
-    index = clash.worst.frame
-    seen = next(iter(seen_frames(recorded, FrameRange(index, index + 1))), None)
-    if seen is None or seen.masks is None:
-        return []
-    rig = recorded.rig_at(index)
-    at_world = clash.worst.on_object_world[None]
-    shown = []
-    for name, image, mask in zip(recorded.views.names, seen.images, seen.masks, strict=True):
-        if image is None:
-            continue
-        camera = rig[name]
-        pixels, depths_m = project_points(camera, at_world)
-        x, y = pixels[0].tolist()
-        inside = min(x, y, camera.width_px - x, camera.height_px - y)
-        if not (math.isfinite(inside) and depths_m[0] > 0):
-            continue
-        scale = camera.pinhole[0, 0] / float(depths_m[0])
-        shown.append((inside > 0, name in clash.worst.ends_at, scale, name, image, mask, (x, y)))
-    shown.sort(key=lambda one: (not one[0], not one[1], -one[2]))
-    pictures = []
-    for number, (_, _, _, name, image, mask, at) in enumerate(shown[:_MOST_CAMERAS]):
-        drawn = draw_overlay(image, rig[name], mask, objects, painter=painter)
-        _ring(drawn, at)
-        says = (
-            f"What {name} saw in frame {index}: the outline of what is real, and {clash.name} "
-            "drawn in, what of it is touched in red; a ring marks the worst place."
-        )
-        size_px = _LARGE_PX if number == 0 else _OTHER_PX
-        pictures.append(
-            PagePicture(
-                webp(_fitted(drawn, size_px), _LARGE_QUALITY), says, f"{name}, frame {index}"
-            )
-        )
-        if number == 0:
-            close = _close_up(drawn, at)
-            says = f"The same, close about the worst place, as {name} saw it."
-            pictures.append(
-                PagePicture(
-                    webp(close, _LARGE_QUALITY), says, f"{name}, close about the worst place"
-                )
-            )
-    return pictures
-
-
-def _ring(image: Image, at: tuple[float, float]) -> None:
-    """Draw a ring about a pixel."""
-    scale = image.shape[0] / 500
-    center = (round(16 * (at[0] - 0.5)), round(16 * (at[1] - 0.5)))
-    for colour, width in (((0, 0, 0), 4), ((255, 255, 255), 2)):
-        thickness = max(1, round(scale * width))
-        cv2.circle(image, center, round(16 * 16 * scale), colour, thickness, cv2.LINE_AA, 4)
-
-
-def _fitted(image: Image, width_px: int) -> Image:
-    """Return a picture of at most so many pixels across."""
-    height, width = image.shape[:2]
-    if width <= width_px:
-        return image
-    size = (width_px, max(1, round(height * width_px / width)))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _close_up(image: Image, at: tuple[float, float]) -> Image:
-    height, width = image.shape[:2]
-    half = max(40, round(0.5 * _CLOSE_SHARE * min(height, width) * 1.2))
-    x = int(np.clip(at[0], half, max(width - half, half)))
-    y = int(np.clip(at[1], half, max(height - half, half)))
-    part = image[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
-    factor = max(1.0, _OTHER_PX / part.shape[1])
-    size = (round(part.shape[1] * factor), round(part.shape[0] * factor))
-    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 # --- Frames as recorded --------------------------------------------------------------------------
@@ -858,7 +702,7 @@ def _frames_shown(
 
 def _small(image: Image, mask: NDArray[np.uint8] | None) -> Image:
     """Return a small picture with the outline of what is real."""
-    small = _fitted(image, _SMALL_PX).copy()
+    small = fitted(image, _SMALL_PX).copy()
     if mask is not None:
         size = (small.shape[1], small.shape[0])
         there = cv2.resize((mask > 0).astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.calib.errors import SessionError
+from hybridve.calib.errors import CalibrationError, SessionError
+from hybridve.calib.formats.rig_json import rig_from_dict
 from hybridve.calib.lens import Undistortion
 from hybridve.calib.rig import Rig
 from hybridve.hull.capture.recording import (
@@ -90,6 +91,20 @@ def open_recorded(report: Report, session: Path) -> tuple[Recorded, str]:
             "are those of the session as it is now"
         )
     return Recorded(loaded, rig, tracks, views, undistortions, stored), doubt
+
+
+def rig_of(report: Report, recorded: Recorded | None) -> Rig | None:
+    """Return the cameras of a report; None if it holds none that can be read."""
+    names = list(report.cameras) or list(report.settings.get("cameras", ()))
+    if recorded is not None:
+        rig = recorded.rig
+    else:
+        try:
+            rig = rig_from_dict(report.rig, f"{report.path}: rig")
+        except CalibrationError:
+            return None
+    known = {camera.name for camera in rig.cameras}
+    return rig.only([name for name in names if name in known] or sorted(known))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

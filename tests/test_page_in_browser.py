@@ -175,6 +175,7 @@ def test_what_each_camera_saw_changes_with_the_frame(folder: Path, tab: Tab) -> 
     tab.one("#scrubber").send_keys(Keys.END)
     last = tab.run(pictures)
 
+    assert "ready masks and no pictures" in tab.one(".missing").text
     assert [alt.split()[1] for alt, _ in first] == ["cam0", "cam1", "cam2", "cam3"]
     assert all("frame 0" in alt for alt, _ in first)
     assert all("frame 5" in alt for alt, _ in last)

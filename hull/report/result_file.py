@@ -54,6 +54,8 @@ class Described:
     def describe(self, dataset: h5py.Dataset) -> None:
         """Write it to a dataset."""
         dataset.attrs["unit"] = self.unit
+        if self.unit != "1":
+            dataset.attrs["units"] = self.unit  # what netCDF's readers look for
         dataset.attrs["kind"] = self.kind
         dataset.attrs["description"] = self.description
 

@@ -53,7 +53,7 @@ def add_vtkhdf(
             collection.block(label, name),
             mesh.faces,
             mesh.vertices_at,
-            _shown_rows(mesh, n_frames),
+            shown_rows(mesh, n_frames),
         )
         shown = collection.block(f"{label}_points", name)
         shown.attrs["sample"] = is_sample
@@ -62,7 +62,7 @@ def add_vtkhdf(
         add_points(shown, parts)
 
 
-def _shown_rows(mesh: StoredMesh, n_frames: int) -> NDArray[np.int64]:
+def shown_rows(mesh: StoredMesh, n_frames: int) -> NDArray[np.int64]:
     """Return the first frame in which a mesh stood where it does in each (F,); -1 if not known."""
     placement = np.broadcast_to(mesh.placement, (n_frames, 3, 4)).reshape(n_frames, 12)
     known = np.flatnonzero(np.isfinite(placement).all(axis=1))

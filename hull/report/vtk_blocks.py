@@ -11,7 +11,7 @@ VTK file formats, section "VTKHDF format", version 2.2 of the format.
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -23,7 +23,7 @@ _VERSION = (2, 2)
 
 #: The kinds of cells of a PolyData, in VTK's order; collision points are vertices.
 _CELLS = ("Vertices", "Lines", "Polygons", "Strips")
-_VERTICES, _POLYGONS = 0, 2
+_POLYGONS = 2
 
 _CHUNK_ROWS = 16_384
 
@@ -45,6 +45,22 @@ class FramePoints:
     n_points: NDArray[np.int64]
     xyz_m: NDArray[np.float32]
     triangle: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameShapes:
+    """Lines or triangles of one frame.
+
+    Attributes
+    ----------
+    points_m : (V, 3) float64
+        Metres about the file's local origin.
+    cells : (N, K) int32
+        Numbers of the points of each.
+    """
+
+    points_m: NDArray[np.float64]
+    cells: NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,19 +173,55 @@ def add_points(block: h5py.Group, parts: Iterable[FramePoints]) -> None:
     offsets = np.column_stack([none, n_points])[
         np.column_stack([np.ones(len(n_points), np.bool_), n_points > 0])
     ]
+    _add_frames(block, "Vertices", n_points, n_cells, n_points, offsets)
+
+
+def add_shapes(
+    block: h5py.Group, kind: Literal["Lines", "Polygons"], parts: Iterable[FrameShapes]
+) -> None:
+    """Add lines or triangles that are others in each frame, a frame after another."""
+    points = _growing(block, "Points", (3,), np.float32)
+    connectivity = _growing(block, f"{kind}/Connectivity", (), np.int64)
+    n_points, n_cells, n_ids, offsets = [], [], [], [np.zeros(0, np.int64)]
+    for part in parts:
+        n_points.append(len(part.points_m))
+        n_cells.append(len(part.cells))
+        n_ids.append(part.cells.size)
+        offsets.append(part.cells.shape[1] * np.arange(len(part.cells) + 1, dtype=np.int64))
+        _append(points, part.points_m.astype(np.float32))
+        _append(connectivity, part.cells.ravel().astype(np.int64))
+    _add_frames(
+        block,
+        kind,
+        np.array(n_points, np.int64),
+        np.array(n_cells, np.int64),
+        np.array(n_ids, np.int64),
+        np.concatenate(offsets),
+    )
+
+
+def _add_frames(
+    block: h5py.Group,
+    kind: str,
+    n_points: NDArray[np.int64],
+    n_cells: NDArray[np.int64],
+    n_ids: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+) -> None:
+    """Add how much each frame (F,) has of cells of one kind, whose points and ids stand there."""
+    none = np.zeros_like(n_points)
     _store(block, "NumberOfPoints", n_points)
-    for number, kind in enumerate(_CELLS):
-        is_vertices = number == _VERTICES
-        _store(block, f"{kind}/NumberOfCells", n_cells if is_vertices else none)
-        _store(block, f"{kind}/NumberOfConnectivityIds", n_points if is_vertices else none)
-        _store(block, f"{kind}/Offsets", offsets if is_vertices else none)
-        if not is_vertices:
-            _growing(block, f"{kind}/Connectivity", (), np.int64)
+    for one in _CELLS:
+        _store(block, f"{one}/NumberOfCells", n_cells if one == kind else none)
+        _store(block, f"{one}/NumberOfConnectivityIds", n_ids if one == kind else none)
+        _store(block, f"{one}/Offsets", offsets if one == kind else none)
+        if one != kind:
+            _growing(block, f"{one}/Connectivity", (), np.int64)
     steps = _add_steps(block, len(n_points))
     _store(steps, "PartOffsets", np.arange(len(n_points), dtype=np.int64))
     _store(steps, "PointOffsets", _before(n_points))
-    _store(steps, "CellOffsets", _vertices_only(_before(n_cells)))
-    _store(steps, "ConnectivityIdOffsets", _vertices_only(_before(n_points)))
+    _store(steps, "CellOffsets", _only(kind, _before(n_cells)))
+    _store(steps, "ConnectivityIdOffsets", _only(kind, _before(n_ids)))
 
 
 def _add_steps(block: h5py.Group, n_frames: int) -> h5py.Group:
@@ -180,9 +232,9 @@ def _add_steps(block: h5py.Group, n_frames: int) -> h5py.Group:
     return steps
 
 
-def _vertices_only(column: NDArray[np.int64]) -> NDArray[np.int64]:
+def _only(kind: str, column: NDArray[np.int64]) -> NDArray[np.int64]:
     table = np.zeros((len(column), len(_CELLS)), np.int64)
-    table[:, _VERTICES] = column
+    table[:, _CELLS.index(kind)] = column
     return table
 
 

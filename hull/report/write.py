@@ -54,6 +54,7 @@ from hybridve.hull.report.result_file import (
     write_run,
     writing,
 )
+from hybridve.hull.report.scales import label_axes
 from hybridve.hull.report.schema import VERSION, Column, FrameResult, ReportHeader
 from hybridve.hull.report.vtk import MOST_SHOWN, add_vtkhdf
 from hybridve.hull.report.vtk_blocks import FramePoints
@@ -234,11 +235,14 @@ class ReportWriter:
         frames = file.create_group("hybridve/frames")
         for column in FRAME_COLUMNS:
             self._store(frames, column, whole[_frame_key(column.name)])
+        time_s = whole[_frame_key("time_s")]
+        label_axes(frames, FRAME_COLUMNS, time_s, header.cameras)
         cameras = file.create_group("hybridve/cameras", track_order=True)  # the session's order
         for number, name in enumerate(header.cameras):
             group = cameras.create_group(name)
             for camera_column in CAMERA_COLUMNS:
                 self._store(group, camera_column, whole[_camera_key(number, camera_column.name)])
+            label_axes(group, CAMERA_COLUMNS, time_s, header.cameras)
             self._store_many(
                 group,
                 partial(_camera_key, number),
@@ -255,6 +259,8 @@ class ReportWriter:
             for table in tables_of(header.parts):
                 for column in table.columns:
                     self._store(group, column, whole[_object_key(number, column.name)])
+            every = [column for table in tables_of(header.parts) for column in table.columns]
+            label_axes(group, every, time_s, header.cameras)
             for offset, columns, count in (
                 (RUN_OFFSET, RUN_COLUMNS, "n_runs"),
                 (PATCH_OFFSET, PATCH_COLUMNS, "n_patches"),

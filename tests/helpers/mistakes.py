@@ -740,6 +740,34 @@ MISTAKES = (
         status=USAGE,
     ),
     Mistake("no such report", "summary S/no.h5", ("no.h5", "there is no such report")),
+    Mistake(
+        "no such report to export",
+        "export S/no.h5 --html S/p.html",
+        ("no.h5", "there is no such report"),
+    ),
+    Mistake(
+        "a report to export that is none",
+        "export SCENE --csv S/tables",
+        ("scene.toml", "not a readable report"),
+    ),
+    Mistake(
+        "a page that exists",
+        "export S/no.h5 --html S/p.html",
+        ("p.html", "exists already", "--overwrite"),
+        written("p.html", "mine"),
+    ),
+    Mistake(
+        "a page of another kind",
+        "export S/no.h5 --html S/p.pdf",
+        ("p.pdf", "pages are .html"),
+        status=USAGE,
+    ),
+    Mistake(
+        "a hull to export without its session",
+        "export S/no.h5 --hull-mesh S/hulls",
+        ("--hull-mesh needs --session SESSION", "a report holds no hull"),
+        status=USAGE,
+    ),
     Mistake("a report that is none", "summary SCENE", ("scene.toml", "not a readable report")),
     Mistake(
         "silhouettes that are damaged",
