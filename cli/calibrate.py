@@ -223,7 +223,7 @@ def _calibrate(
     from hybridve.hull.capture.rig import calibrate_session, take_elsewhere
 
     path = folder / "rig.json"
-    certificate = None
+    certificate = page = None
     if session.rig_file is not None:
         rig = take_elsewhere(session, terminal.stage)
         _make(folder)
@@ -235,16 +235,19 @@ def _calibrate(
             rig, calibration.record, calibration.seen, volume, calibration.boards_world
         )
         _make(folder)
-        _write_certificate(
+        page = _write_certificate(
             folder, session, calibration, certificate, volume, max_error_m, with_page
         )
     no_colmap = _write_colmap(folder / "colmap", rig)
     write_rig(path, rig)
     if as_json:
         numbers = _numbers(path, rig, certificate) | {"no_colmap_model": no_colmap}
+        numbers["page"] = None if page is None else str(page)
         click.echo(json.dumps(to_json(numbers)))
     else:
         _print(path, rig, certificate)
+        if page is not None:
+            click.echo(f"  the certificate, with pictures: {page}")
         if no_colmap is not None:
             click.echo(f"  {no_colmap}")
     if max_error_m is not None:
@@ -284,7 +287,8 @@ def _write_certificate(
     volume: "Volume",
     max_error_m: float | None,
     with_page: bool,
-) -> None:
+) -> Path | None:
+    """Write the certificate; return its page, None without one."""
     from hybridve.calib.errors import CalibrationError
     from hybridve.calib.files import appearing
 
@@ -298,9 +302,10 @@ def _write_certificate(
     page = folder / "certificate.html"
     if not with_page:
         page.unlink(missing_ok=True)  # one of an older rig would be believed
-        return
+        return None
     from hybridve.calib.plain import to_plain
     from hybridve.hull.view.certificate_page import write_certificate_page
+    from hybridve.hull.world_photo import world_photo
 
     write_certificate_page(
         page,
@@ -311,7 +316,9 @@ def _write_certificate(
         title=session.name,
         details=to_plain(calibration.record),
         max_error_m=max_error_m,
+        photo=world_photo(session, calibration.rig, calibration.record),
     )
+    return page
 
 
 #: Distances between cameras that are told one by one: of five cameras.

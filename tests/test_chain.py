@@ -155,9 +155,8 @@ def frames_of(path: Path) -> list[NDArray[np.uint8]]:
     import av
 
     with av.open(str(path)) as film:
-        return [
-            np.asarray(frame.to_ndarray(format="bgr24"), np.uint8) for frame in film.decode(video=0)
-        ]
+        pictures = [frame.to_ndarray(format="bgr24") for frame in film.decode(video=0)]
+    return [np.asarray(picture, np.uint8) for picture in pictures]
 
 
 @pytest.mark.slow

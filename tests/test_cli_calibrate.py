@@ -164,7 +164,9 @@ def test_the_certificate_is_the_same_in_all_forms(
     assert certificate["doubts"] == []
     assert page.count("<img") > 3
     assert certificate["verdict"].split(";")[0] in page
+    assert "data:image/jpeg;base64," in page, "the board, with the world's axes"
     assert told["rig"] == str(folder / "rig.json")
+    assert told["page"] == str(folder / "certificate.html")
     assert [one["name"] for one in told["cameras"]] == ["cam1", "cam2", "cam3"]
 
 
@@ -196,6 +198,7 @@ def test_a_second_run_reads_no_picture_and_says_the_same(
 
     again = json.loads(capsys.readouterr().out)
     assert again["certificate"] == calibrated[1]["certificate"]
+    assert again["page"] is None
     assert not (out / "certificate.html").exists()
 
 

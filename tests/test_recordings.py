@@ -17,17 +17,24 @@ from hybridve.calib.camera import Camera
 from hybridve.calib.formats.rig_json import read_rig
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.record import CalibrationRecord
+from hybridve.hull.agreement.others import meets_others
+from hybridve.hull.agreement.search import make_pencils
+from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.recording import FrameRange, segmented_frames
 from hybridve.hull.capture.rig import load_rig
 from hybridve.hull.capture.room_check import check_room
 from hybridve.hull.capture.room_shift import room_shift
 from hybridve.hull.capture.session import load_session
 from hybridve.hull.capture.silhouette_io import SilhouetteReader
-from hybridve.hull.chain import rig_views
+from hybridve.hull.chain import EvaluateSettings, make_chain, rig_views
 from hybridve.hull.query.bounds import boxes_are_free
+from hybridve.hull.query.choose import open_engine
 from hybridve.hull.query.reference import contains_points
 from hybridve.hull.query.silhouettes import Hull, make_hull
 from hybridve.hull.report.read import read_points, read_report
+from hybridve.hull.show import take_shot
+from hybridve.hull.view.paint import Painter
+from hybridve.hull.view.recorded import recorded_view
 
 pytestmark = pytest.mark.recording
 
@@ -356,3 +363,32 @@ def test_every_dataset_of_a_real_report_is_readable(
 
         file.visititems(read)
     assert n_read > 50
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.parametrize(
+    ("name", "frame", "cameras"),
+    [("dino_ring", 0, (0, 9, 13)), ("child_rope", 20, (0, 7)), ("horseman", 100, (0, 1, 2, 3))],
+)
+def test_from_a_recorded_cameras_place_one_sees_its_silhouette(
+    horseman: Path, name: str, frame: int, cameras: tuple[int, ...]
+) -> None:
+    """Nothing beside it, and all of it that the other cameras confirm: what the hull can be."""
+    folder = horseman if name == "horseman" else DATA / name
+    chain = make_chain(load_session(folder), load_scene(folder / "scene.toml"), EvaluateSettings())
+    with open_engine("native") as engine:
+        hull = take_shot(chain, frame, engine).hull
+    pencils = make_pencils(hull.views)
+
+    with Painter() as painter:
+        for camera in cameras:
+            width, height = (int(side) for side in hull.views.sizes_px[camera])
+            view = recorded_view(hull.views, camera, (1e-3, 1e6))
+            drawn = np.isfinite(painter.depth(hull, view, (width, height)))
+            silhouette = hull.mask(camera) > 0
+            confirmed = silhouette & meets_others(hull, camera, pencils)
+            assert not (drawn & ~silhouette).any()
+            assert (drawn & confirmed).sum() / (drawn | confirmed).sum() > 0.98
+            if name == "horseman":
+                assert (drawn & silhouette).sum() / (drawn | silhouette).sum() > 0.98

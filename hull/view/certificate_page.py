@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
@@ -35,6 +36,9 @@ State = Literal["good", "limits", "refused"]
 
 #: Marks put in as images have this many dots an inch.
 _DPI = 150
+
+#: A photograph is at most so wide.
+_PHOTO_PX = 960
 
 #: The error without its largest cause must be smaller by this factor for the cause to stand out.
 _STANDS_OUT = 0.8
@@ -61,6 +65,25 @@ class _CameraTold:
     parameters: tuple[_Parameter, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """A picture in which one sees where the world is.
+
+    Attributes
+    ----------
+    camera : str
+        Which camera took it.
+    axis_m : float
+        How long the axes are that are drawn in it, metres.
+    image : (H, W, 3) uint8
+        BGR.
+    """
+
+    camera: str
+    axis_m: float
+    image: NDArray[np.uint8]
+
+
 def write_certificate_page(
     path: Path,
     rig: Rig,
@@ -71,6 +94,7 @@ def write_certificate_page(
     title: str,
     details: Mapping[str, Any],
     max_error_m: float | None = None,
+    photo: Photo | None = None,
 ) -> None:
     """Write the page, which appears only when it is complete.
 
@@ -92,6 +116,8 @@ def write_certificate_page(
         Plain values, lists and mappings, nested at will: how the calibration came about.
     max_error_m : float, optional
         The error that is asked for: a rig that is worse, or has none, is refused.
+    photo : Photo, optional
+        A picture in which the world's axes are drawn.
 
     Raises
     ------
@@ -126,6 +152,8 @@ def write_certificate_page(
         todo=_todo(certificate),
         error_map=error_map,
         arrangement=arrangement,
+        photo=None if photo is None else (photo, _jpeg(photo.image)),
+        world=getattr(rig.provenance, "world", None),
         cameras=cameras,
         details=details,
     )
@@ -157,6 +185,17 @@ def _svg(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", dpi=_DPI, metadata={"Date": None})
     return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _jpeg(image: NDArray[np.uint8]) -> str:
+    """Return a picture, not wider than a page needs it, in base64."""
+    height, width = image.shape[:2]
+    share = min(1.0, _PHOTO_PX / width)
+    if share < 1.0:
+        size = (_PHOTO_PX, max(1, round(share * height)))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return base64.b64encode(encoded.tobytes()).decode("ascii")
 
 
 def _stands_out(certificate: Certificate) -> bool:

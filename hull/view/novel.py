@@ -270,7 +270,7 @@ class HullOnDevice:
         self._program, self._triangle = march
         self._views = hull.views
         self.cells = hull_cells(hull) if cells is None else cells
-        regions = [_region(hull, camera) for camera in range(len(hull.views))]
+        regions = [_region(hull, camera, self.cells) for camera in range(len(hull.views))]
         # Without any object pixel in a camera that carves, nothing is inside.
         self._n_cameras = 0 if len(self.cells) == 0 or None in regions else len(regions)
         self._upload(hull, [region for region in regions if region is not None])
@@ -410,8 +410,11 @@ class _Region:
     window: NDArray[np.int64]
 
 
-def _region(hull: Hull, camera: int) -> _Region | None:
-    """Return a camera's region; None where it carves everything."""
+def _region(hull: Hull, camera: int, cells: Cells) -> _Region | None:
+    """Return a camera's region; None where it carves everything.
+
+    What of its silhouette is beside all cells has no part in the hull.
+    """
     mask = hull.mask(camera)
     if hull.views.unseen == "keep":
         # Beyond the border the camera abstains: a ray may become free there.
@@ -427,12 +430,39 @@ def _region(hull: Hull, camera: int) -> _Region | None:
         window = np.array([0, 0, width, height])
         return _Region(distance, _blurred(mask), np.zeros(2, np.int64), window)
     x, y, width, height = cv2.boundingRect(mask)
-    if width == 0 or height == 0:
+    low, high = np.array([x, y]), np.array([x + width, y + height])
+    around = _pixels_of_cells(hull, camera, cells)
+    if around is not None:
+        low, high = np.maximum(low, around[0]), np.minimum(high, around[1])
+    if (low >= high).any():
         return None
-    part = np.pad(mask[y : y + height, x : x + width], _MARGIN_PX)
+    # With what of the silhouette lies right beside the window, or its border would be an edge.
+    first, last = np.maximum(low - _MARGIN_PX, 0), np.minimum(high + _MARGIN_PX, mask.shape[::-1])
+    beside = np.stack([first - (low - _MARGIN_PX), high + _MARGIN_PX - last], axis=1)
+    part = np.pad(mask[first[1] : last[1], first[0] : last[0]], beside[::-1])
     # Where the window lies in the region, and the region in the image.
-    window = np.array([0, 0, width, height]) + _MARGIN_PX
-    return _Region(_distance(1 - part), _blurred(part), np.array([x, y]) - _MARGIN_PX, window)
+    window = np.concatenate([np.zeros(2, np.int64), high - low]) + _MARGIN_PX
+    return _Region(_distance(1 - part), _blurred(part), low - _MARGIN_PX, window)
+
+
+def _pixels_of_cells(
+    hull: Hull, camera: int, cells: Cells
+) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+    """Return where a camera sees the box of the cells: the first pixel, the one after the last.
+
+    None where the box reaches behind the camera.
+    """
+    low, high = cells.box_local()
+    corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
+    matrix = hull.views.img_from_local[camera]
+    projected = corners @ matrix[:, :3].T + matrix[:, 3]
+    if (projected[:, 2] <= 1e-6 * np.abs(corners).max()).any():
+        return None
+    pixels = projected[:, :2] / projected[:, 2:]
+    limit = 1e6
+    first = np.floor(np.clip(pixels.min(axis=0), -limit, limit)).astype(np.int64)
+    last = np.ceil(np.clip(pixels.max(axis=0), -limit, limit)).astype(np.int64)
+    return first - 1, last + 1
 
 
 def _distance(background: NDArray[np.uint8]) -> NDArray[np.uint8]:

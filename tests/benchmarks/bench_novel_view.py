@@ -44,7 +44,7 @@ SIZE_PX = (320, 240)
 DEPTHS_PER_PX = 0.5
 
 #: How many boxes tell where the hull is: for the eye few will do.
-MOST_CELLS = 2000
+MOST_CELLS = 300
 
 N_FRAMES = 10
 

@@ -1,6 +1,7 @@
 """How near pictures of the hull come to what cameras saw: their outline, and their colours.
 
-`outline`: the hull of all cameras, drawn from the place of each, beside that camera's silhouette:
+`outline`: the hull of all cameras, drawn from the place of each, beside that camera's silhouette
+(less the pieces that no other camera confirms, which `render` leaves out):
 pixels in common over pixels of either; how many lie beside the silhouette; and the same beside what
 of the silhouette all others confirm (`meets_others`), which is the hull itself. `colours`: each
 camera in turn is left out, hull and colours come from the others, and within hull and silhouette
@@ -28,8 +29,9 @@ from hybridve.hull.capture.recording import FrameRange
 from hybridve.hull.capture.rig import calibrate_session, load_rig
 from hybridve.hull.capture.session import Session, load_session
 from hybridve.hull.chain import Chain, EvaluateSettings, hulls, rig_views
+from hybridve.hull.query.choose import open_engine
 from hybridve.hull.query.silhouettes import Hull
-from hybridve.hull.show import Image, pinhole_images
+from hybridve.hull.show import Image, pinhole_images, take_shot
 from hybridve.hull.view.cells import hull_cells
 from hybridve.hull.view.paint import PaintedScene, Painter, floor_under
 from hybridve.hull.view.recorded import view_of_matrix
@@ -78,7 +80,8 @@ def recordings(asked: argparse.Namespace) -> Iterator[Recording]:
 
 def outline(one: Recording, painter: Painter, most: int) -> dict[str, float]:
     """Return how far outlines from the cameras' places are those of their silhouettes."""
-    hull = hull_of(one.chain())
+    with open_engine("native") as engine:
+        hull = take_shot(one.chain(), one.frame, engine).hull
     pencils = make_pencils(hull.views)
     shares, of_hull, beside = [], [], 0
     for camera in range(min(len(hull.views), most)):
