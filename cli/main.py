@@ -1,14 +1,18 @@
 """The command ``hybridve``: its sub-commands, and the one place where errors become text."""
 
+import errno
 import logging
 import re
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from importlib.metadata import version
 from typing import NoReturn
 
 import click
 
+from hybridve.calib.bounded import printable
 from hybridve.calib.errors import HybridveError
 from hybridve.cli.board import board
 from hybridve.cli.calibrate import calibrate
@@ -20,6 +24,7 @@ from hybridve.cli.detect import detect
 from hybridve.cli.diff import diff
 from hybridve.cli.doctor import doctor
 from hybridve.cli.init import init
+from hybridve.cli.options import tell
 from hybridve.cli.plan import plan
 from hybridve.cli.render import render
 from hybridve.cli.segment import segment
@@ -31,6 +36,20 @@ from hybridve.cli.synth import synth
 
 #: Exit status of a run that was interrupted, as shells have it: 128 + SIGINT.
 _INTERRUPTED = 130
+
+#: And of one that was told to end, by a scheduler or by a container that stops: 128 + SIGTERM.
+_TERMINATED = 143
+
+
+class _TerminatedError(KeyboardInterrupt):
+    """SIGTERM has come: what is open is closed, as where a person presses Ctrl-C."""
+
+
+class _Printable(logging.Formatter):
+    """Spells out what a terminal would obey: names of files and things come from strangers."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
 
 
 class _InOrder(click.Group):
@@ -61,9 +80,9 @@ def cli(verbose: int, quiet: bool) -> None:
     level = (
         logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     )
-    logging.basicConfig(
-        stream=sys.stderr, level=level, format="%(levelname)s: %(message)s", force=True
-    )
+    logging.basicConfig(stream=sys.stderr, level=level, force=True)
+    for handler in logging.root.handlers:
+        handler.setFormatter(_Printable("%(levelname)s: %(message)s"))
 
 
 for command in (
@@ -77,18 +96,25 @@ for command in (cli, *cli.commands.values()):
     command.help = (command.help or "").replace("\\b", "\b")
 
 
-def _leave_interrupted() -> NoReturn:
-    click.echo("interrupted", err=True)
-    sys.exit(_INTERRUPTED)
+def _terminate(*_: object) -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: what follows is tidying up
+    raise _TerminatedError
 
 
-def _is_interruption(error: BaseException | None) -> bool:
-    """Tell whether an error comes from Ctrl-C.
+def _leave_interrupted(error: BaseException) -> NoReturn:
+    was_told = _is_caused_by(error, _TerminatedError)
+    click.echo("terminated" if was_told else "interrupted", err=True)
+    sys.exit(_TERMINATED if was_told else _INTERRUPTED)
 
-    Pressed while compiled code hands its result to Python, it arrives wrapped in SystemErrors.
+
+def _is_caused_by(error: BaseException | None, kind: type[BaseException]) -> bool:
+    """Tell whether an error comes from one of a kind, as a KeyboardInterrupt is from Ctrl-C.
+
+    Pressed while compiled code hands its result to Python, it arrives wrapped in SystemErrors;
+    click wraps it, too.
     """
     while error is not None:
-        if isinstance(error, KeyboardInterrupt):
+        if isinstance(error, kind):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -112,8 +138,29 @@ def _in_order(words: Sequence[str]) -> list[str]:
     return [*first, *rest, *words[end:]]
 
 
+def _refuse(*lines: str) -> NoReturn:
+    """Tell what is wrong, a line each, and leave."""
+    for line in lines:
+        tell(f"error: {line}", err=True)
+    sys.exit(1)
+
+
+def _of_file(error: OSError) -> str:
+    return "" if error.filename is None else f"{error.filename}: "
+
+
+def _way_out(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "; free some room there and run it again"
+    if error.errno in (errno.EIO, errno.ESTALE, errno.ENOTCONN):
+        return "; is the disk or the network folder still there?"
+    return ""
+
+
 def main() -> NoReturn:
     """Run the command line and leave with its exit status."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         cli.main(_in_order(sys.argv[1:]), standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:  # whose message is the help
@@ -124,27 +171,32 @@ def main() -> NoReturn:
         command = "hybridve" if context is None else context.command_path
         text = error.format_message().rstrip(".")
         between = "" if text.endswith("?") else ";"
-        click.echo(f"error: {text}{between} `{command} --help` shows what there is", err=True)
+        tell(f"error: {text}{between} `{command} --help` shows what there is", err=True)
         sys.exit(error.exit_code)
     except HybridveError as error:
-        for line in error.lines:
-            click.echo(f"error: {line}", err=True)
-        sys.exit(1)
+        _refuse(*error.lines)
     except ImportError as error:
         if (error.name or "").startswith("hybridve"):
             raise
-        click.echo(
-            f"error: {error.name or 'a library'} cannot be loaded ({error}); "
-            "`hybridve doctor` tells what is missing and what installs it",
-            err=True,
+        _refuse(
+            f"{error.name or 'a library'} cannot be loaded ({error}); "
+            "`hybridve doctor` tells what is missing and what installs it"
         )
-        sys.exit(1)
-    except (KeyboardInterrupt, click.Abort):
-        _leave_interrupted()
-    except SystemError as error:
-        if not _is_interruption(error):
+    except (KeyboardInterrupt, click.Abort, SystemError) as error:
+        if not isinstance(error, click.Abort) and not _is_caused_by(error, KeyboardInterrupt):
             raise
-        _leave_interrupted()
+        _leave_interrupted(error)
+    except OSError as error:
+        # Where files are written and read, what goes wrong is told in their own terms. What comes
+        # here is a disk that is full or gone in the midst of something else.
+        if error.errno is None:
+            raise
+        _refuse(f"{_of_file(error)}{error.strerror}{_way_out(error)}")
+    except MemoryError:
+        _refuse(
+            "there is not enough memory; take fewer frames (--frames) or a smaller viewport, or "
+            "close other programs"
+        )
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
     sys.exit(0)

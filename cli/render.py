@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,7 +13,18 @@ if TYPE_CHECKING:
     from hybridve.hull.report.read import Report
 
 
-@click.command(short_help="Draw one frame: cameras, hull, CAD, collisions in red; or a simulation.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["session"], values["scene"], values["report"], values["sim"]),
+        writes=options.given(values["output"]),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Draw one frame: cameras, hull, CAD, collisions in red; or a simulation.",
+)
 @options.session_arg
 @options.scene_option
 @options.output_option("The picture to write, a .png or .jpg; of a simulation also a film, .mp4.")

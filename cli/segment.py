@@ -3,6 +3,7 @@
 import json
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,7 +11,18 @@ from hybridve.cli import options
 from hybridve.cli.progress import Terminal
 
 
-@click.command(short_help="Cut the real things out of the recording.")
+def _folder(session: Path) -> Path:
+    return session if session.is_dir() else session.parent
+
+
+def _files(values: dict[str, Any]) -> options.Files:
+    session = values["session"]
+    return options.Files(reads=[session], keeps=[_folder(session) / "silhouettes.h5"])
+
+
+@click.command(
+    cls=options.Command, files=_files, short_help="Cut the real things out of the recording."
+)
 @options.session_arg
 @click.option(
     "--unconfirmed/--no-unconfirmed",
@@ -61,7 +73,7 @@ def segment(
 
     cv2.setNumThreads(1)  # each camera has a thread of its own; more would fight
     terminal = Terminal(enabled=progress)
-    folder = session if session.is_dir() else session.parent
+    folder = _folder(session)
     output = folder / "silhouettes.h5"
     loaded, _ = ask_all(
         lambda: opened_session(session),
@@ -105,7 +117,7 @@ def segment(
     means = looks.shares.mean(axis=0).tolist() if looks.index else [0.0] * len(names)
     shares = dict(zip(names, means, strict=True))
     if as_json:
-        click.echo(
+        options.tell(
             json.dumps(
                 {
                     "silhouettes": str(output),
@@ -120,12 +132,12 @@ def segment(
             )
         )
         return
-    click.echo(
+    options.tell(
         f"{output}: {n_frames} frames, {n_invalid} without all cameras, "
         f"{output.stat().st_size / 1e6:.1f} MB"
     )
     for name, share in shares.items():
-        click.echo(f"  {name}: {share:.1%} of the picture is object, on average")
+        options.tell(f"  {name}: {share:.1%} of the picture is object, on average")
     trust = "" if agreement.is_trusted else "not to be trusted: "
     for cause in agreement.causes:
-        click.echo(f"  {trust if cause.is_gross else ''}{cause.message}")
+        options.tell(f"  {trust if cause.is_gross else ''}{cause.message}")
