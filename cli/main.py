@@ -14,6 +14,7 @@ import click
 
 from hybridve.calib.bounded import printable
 from hybridve.calib.errors import HybridveError
+from hybridve.cli.batch import batch
 from hybridve.cli.board import board
 from hybridve.cli.calibrate import calibrate
 from hybridve.cli.check import check
@@ -33,6 +34,7 @@ from hybridve.cli.spacing import spacing
 from hybridve.cli.summary import summary
 from hybridve.cli.sweep import sweep
 from hybridve.cli.synth import synth
+from hybridve.cli.threads import take_threads
 
 #: Exit status of a run that was interrupted, as shells have it: 128 + SIGINT.
 _INTERRUPTED = 130
@@ -63,7 +65,13 @@ class _InOrder(click.Group):
 @click.version_option(version("hybridve"), prog_name="hybridve")
 @click.option("-v", "--verbose", count=True, help="Tell more on stderr; twice for everything.")
 @click.option("-q", "--quiet", is_flag=True, help="Tell only errors on stderr.")
-def cli(verbose: int, quiet: bool) -> None:
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Use so many processors and no more. Default: all that there are.",
+)
+def cli(verbose: int, quiet: bool, threads: int | None) -> None:
     r"""Tell what real thing in a recording touched which CAD part, frame by frame.
 
     \b
@@ -77,6 +85,8 @@ def cli(verbose: int, quiet: bool) -> None:
     4 a rig is worse than --max-error-mm or does not pass --check, 6 diff found something worse,
     130 interrupted.
     """
+    if threads is not None:
+        take_threads(threads)
     level = (
         logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     )
@@ -86,7 +96,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 
 for command in (
-    *(demo, synth, plan, init, board, check, calibrate, convert, segment, detect),
+    *(demo, synth, plan, init, board, check, calibrate, convert, segment, detect, batch),
     *(spacing, sweep, simulate, summary, clashes, diff, render, doctor),
 ):
     cli.add_command(command)
@@ -121,7 +131,7 @@ def _is_caused_by(error: BaseException | None, kind: type[BaseException]) -> boo
 
 
 #: What may stand behind a command as well as before it.
-_FOR_ALL = re.compile(r"-q|-v+|--quiet|--verbose")
+_FOR_ALL = re.compile(r"-q|-v+|--quiet|--verbose|--threads=.*")
 
 
 def _in_order(words: Sequence[str]) -> list[str]:
@@ -132,7 +142,12 @@ def _in_order(words: Sequence[str]) -> list[str]:
     >>> _in_order(["detect", "s", "-q", "-o", "r.h5"])
     ['-q', 'detect', 's', '-o', 'r.h5']
     """
-    end = list(words).index("--") if "--" in words else len(words)
+    words = list(words)
+    end = words.index("--") if "--" in words else len(words)
+    if "--threads" in words[: end - 1]:
+        at = words.index("--threads")
+        words[at : at + 2] = [f"--threads={words[at + 1]}"]
+        end -= 1
     first = [word for word in words[:end] if _FOR_ALL.fullmatch(word)]
     rest = [word for word in words[:end] if not _FOR_ALL.fullmatch(word)]
     return [*first, *rest, *words[end:]]
