@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from hybridve.calib.avi_index import AviFrames, avi_frames, is_avi
 from hybridve.calib.errors import SessionError
 from hybridve.calib.files import nearly
+from hybridve.calib.opencv_files import decode_picture, open_capture
 
 _log = logging.getLogger(__name__)
 
@@ -452,10 +453,7 @@ def read_raw(path: Path) -> Image:
 
 
 def _decoded(path: Path, flags: int) -> Image:
-    image = cv2.imread(str(path), flags)
-    if image is None:
-        raise SessionError(f"{path}: not an image that can be read")
-    return image
+    return decode_picture(path, flags)
 
 
 #: Depths of sensors that write files of 16 bits.
@@ -497,7 +495,7 @@ def _is_shallow_png(path: Path) -> bool:
 
 
 def _open_video(path: Path, label: str) -> cv2.VideoCapture:
-    video = cv2.VideoCapture(str(path))
+    video = open_capture(path)
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     if not video.isOpened():
         raise SessionError(f"{label}: {path} is not a video that can be read")

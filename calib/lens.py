@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from hybridve.calib.cache import cache_key, find_arrays, keep_arrays
 from hybridve.calib.camera import Camera
+from hybridve.calib.colmap_library import pycolmap
 
 #: An undistorted image reaches at most this far off the axis, in degrees: a pinhole image of a
 #: wider lens has no finite size. What a fisheye sees beyond is cut off and counts as not seen.

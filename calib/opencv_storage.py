@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.opencv_files import structured_text
 
 
 class NotOpencvError(CalibrationError):
@@ -34,9 +35,12 @@ def read_storage(path: Path) -> dict[str, Any]:
         If it is none of OpenCV's, or OpenCV cannot read it.
     """
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        text = structured_text(path)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         is_open = storage.isOpened()
-    except (cv2.error, SystemError):
+    except ValueError as error:
+        raise NotOpencvError(f"{path}: {error}; that is no rig") from error
+    except (cv2.error, SystemError, OSError):
         is_open = False
     if not is_open:
         raise NotOpencvError(

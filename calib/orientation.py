@@ -8,13 +8,12 @@ from pathlib import Path
 
 import cv2
 
+from hybridve.calib.opencv_files import open_capture
+
 #: EXIF's number of the orientation, and how many bytes of a file are looked at for it.
 _ORIENTATION, _LOOKED_AT = 0x0112, 65_536 + 16
 
 _JPEG, _PNG, _TIFF = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*")
-
-#: The marks in a JPEG behind which its size stands: of all its ways to code, but no tables.
-_FRAMES_OF_JPEG = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 #: What EXIF's numbers from 2 on say, for messages.
 _WAYS = {
@@ -38,7 +37,7 @@ def said_orientation(path: Path, *, is_video: bool) -> str:
     """
     if not is_video:
         return _WAYS.get(exif_orientation(path), "")
-    video = cv2.VideoCapture(str(path))
+    video = open_capture(path)
     turn_deg = round(video.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 if video.isOpened() else 0
     video.release()
     return f"turned by {turn_deg} degrees" if turn_deg else ""
@@ -68,33 +67,6 @@ def exif_orientation(path: Path) -> int:
     except struct.error:
         return 1
     return found if 1 <= found <= 8 else 1
-
-
-def picture_size(path: Path) -> tuple[int, int] | None:
-    """Return the width and height that the header of a JPEG or PNG says; None of other files.
-
-    Examples
-    --------
-    >>> picture_size(Path("there is no such file")) is None
-    True
-    """
-    try:
-        with path.open("rb") as file:
-            head = file.read(24)
-            if head.startswith(_PNG) and len(head) == 24:
-                width_px, height_px = struct.unpack_from(">II", head, 16)
-                return width_px, height_px
-            if not head.startswith(_JPEG):
-                return None
-            file.seek(2)
-            while len(mark := file.read(4)) == 4 and mark[0] == 0xFF:
-                if mark[1] in _FRAMES_OF_JPEG:
-                    height_px, width_px = struct.unpack_from(">HH", file.read(5), 1)
-                    return width_px, height_px
-                file.seek(int.from_bytes(mark[2:]) - 2, 1)
-    except (OSError, struct.error):
-        return None
-    return None
 
 
 def _of_jpeg(head: bytes) -> bytes:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -28,7 +29,18 @@ where all see it, which makes the floor the world's plane z = 0.
 Light it evenly, without gloss; leave the white margin on."""
 
 
-@click.command(short_help="Print a session's board, to scale.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["session"]),
+        writes=options.given(values["output"]),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Print a session's board, to scale.",
+)
 @options.session_arg
 @options.output_option("The PDF to write: a page for each board, in its true size.")
 @options.overwrite_option
@@ -63,13 +75,13 @@ def board(session: Path, output: Path, overwrite: bool, as_json: bool) -> None:
             }
             for one, page in zip(boards, pages, strict=True)
         ]
-        click.echo(json.dumps({"file": str(output), "pages": told}))
+        options.tell(json.dumps({"file": str(output), "pages": told}))
         return
     for number, (one, page) in enumerate(zip(boards, pages, strict=True), start=1):
         size = f"{page.width_mm:.0f} x {page.height_mm:.0f} mm"
-        click.echo(f"{output}: page {number}: {one}")
-        click.echo(f"  {size}, {_paper_for(page.width_mm, page.height_mm)}")
-    click.echo(_ADVICE)
+        options.tell(f"{output}: page {number}: {one}")
+        options.tell(f"  {size}, {_paper_for(page.width_mm, page.height_mm)}")
+    options.tell(_ADVICE)
 
 
 def _paper_for(width_mm: float, height_mm: float) -> str:

@@ -63,7 +63,25 @@ class BoxMillimetres(click.ParamType["Box"]):
         return low, high
 
 
-@click.command(short_help="Find where the cameras stand, from pictures of boards, and how surely.")
+def _folder(session: Path, output: Path | None) -> Path:
+    """Return the folder of the rig."""
+    return output or (session if session.is_dir() else session.parent) / "rig"
+
+
+def _files(values: dict[str, Any]) -> options.Files:
+    reads = options.given(values["session"], values["checked"])
+    if values["checked"] is not None:
+        return options.Files(reads)
+    folder = _folder(values["session"], values["output"])
+    # The folder need not be there yet, so it is held, and not the file in it.
+    return options.Files(reads, writes=[folder], keeps=[folder / "rig.json"])
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Find where the cameras stand, from pictures of boards, and how surely.",
+)
 @options.session_arg
 @click.option(
     "-o",
@@ -147,7 +165,7 @@ def calibrate(
     for option, value in (("--rig-unit", rig_unit), ("--pixel-centre", pixel_centre)):
         if value is not None:
             raise click.UsageError(f"{option} goes with --check")
-    folder = output or (session if session.is_dir() else session.parent) / "rig"
+    folder = _folder(session, output)
     loaded, _ = ask_all(
         lambda: opened_session(session),
         lambda: refuse_existing_in(folder, "rig.json", overwrite=overwrite),
@@ -190,7 +208,7 @@ def _check(
     )
     check = check_session(session, rig, terminal.stage)
     if as_json:
-        click.echo(json.dumps(to_json({"rig": str(source), **asdict(check)})))
+        options.tell(json.dumps(to_json({"rig": str(source), **asdict(check)})))
     else:
         _print_check(source, check)
     if not check.is_trustworthy:
@@ -198,10 +216,10 @@ def _check(
 
 
 def _print_check(source: Path, check: "RigCheck") -> None:
-    click.echo(f"{source}: {check.message}")
+    options.tell(f"{source}: {check.message}")
     missed = ", ".join(f"{name} {rms_px:.2f}" for name, rms_px in check.rms_px.items())
-    click.echo(f"  boards are missed by, px rms: {missed}")
-    click.echo(f"  scale: {check.scale:.4f}")
+    options.tell(f"  boards are missed by, px rms: {missed}")
+    options.tell(f"  scale: {check.scale:.4f}")
 
 
 # --- A rig that is made -----------------------------------------------------------------------
@@ -243,13 +261,13 @@ def _calibrate(
     if as_json:
         numbers = _numbers(path, rig, certificate) | {"no_colmap_model": no_colmap}
         numbers["page"] = None if page is None else str(page)
-        click.echo(json.dumps(to_json(numbers)))
+        options.tell(json.dumps(to_json(numbers)))
     else:
         _print(path, rig, certificate)
         if page is not None:
-            click.echo(f"  the certificate, with pictures: {page}")
+            options.tell(f"  the certificate, with pictures: {page}")
         if no_colmap is not None:
-            click.echo(f"  {no_colmap}")
+            options.tell(f"  {no_colmap}")
     if max_error_m is not None:
         _gate(certificate, max_error_m)
 
@@ -290,13 +308,12 @@ def _write_certificate(
 ) -> Path | None:
     """Write the certificate; return its page, None without one."""
     from hybridve.calib.errors import CalibrationError
-    from hybridve.calib.files import appearing
+    from hybridve.calib.files import write_whole
 
     text = json.dumps(certificate.to_dict(), indent=1, allow_nan=False) + "\n"
     path = folder / "certificate.json"
     try:
-        with appearing(path) as partial:
-            partial.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written: {error}") from error
     page = folder / "certificate.html"
@@ -331,7 +348,7 @@ def _gate(certificate: "Certificate | None", max_error_m: float) -> None:
     if error_m <= max_error_m:
         return
     found = f"{millimetres(error_m)} mm" if math.isfinite(error_m) else "an unknown error"
-    click.echo(
+    options.tell(
         f"error: the rig is good to {found}, not to {1000 * max_error_m:g} mm as --max-error-mm "
         "asks; it was written all the same",
         err=True,
@@ -391,10 +408,10 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
 
     record = _record_of(rig)
     if certificate is not None:
-        click.echo(certificate.verdict)
-    click.echo(f"{path}: {len(rig.cameras)} cameras")
+        options.tell(certificate.verdict)
+    options.tell(f"{path}: {len(rig.cameras)} cameras")
     if certificate is not None:
-        click.echo(f"  {_volume_text(certificate)}")
+        options.tell(f"  {_volume_text(certificate)}")
     certified = {} if certificate is None else {one.name: one for one in certificate.cameras}
     for camera in rig.cameras:
         x, y, z = camera.center_world
@@ -402,34 +419,34 @@ def _print(path: Path, rig: "Rig", certificate: "Certificate | None") -> None:
         if camera.name in certified:
             place += f" +- {millimetres(certified[camera.name].place_std_m)} mm"
         told = None if record is None else record.cameras.get(camera.name)
-        click.echo("; ".join([f"  {camera.name}: {camera.model}, {place}", *_views_of(told)]))
+        options.tell("; ".join([f"  {camera.name}: {camera.model}, {place}", *_views_of(told)]))
         if told is not None:
             if told.model_chosen is not None:
-                click.echo(f"    {told.model_chosen.reason}")
+                options.tell(f"    {told.model_chosen.reason}")
             for remark in (*told.warnings, *_counted(told.notes)):
-                click.echo(f"    {remark}")
+                options.tell(f"    {remark}")
     distances_m = sorted(_distances_m(rig).items(), key=lambda one: one[1])
     if len(distances_m) > _MOST_DISTANCES:  # of 20 cameras there are 190
         near, far = (
             ", ".join(f"{pair} {metres:.3f}" for pair, metres in part)
             for part in (distances_m[:3], distances_m[-3:])
         )
-        click.echo(f"  {len(distances_m)} distances, m: {near}, .. {far}; --json has all")
+        options.tell(f"  {len(distances_m)} distances, m: {near}, .. {far}; --json has all")
     elif distances_m:
         pairs = ", ".join(f"{pair} {metres:.3f}" for pair, metres in _distances_m(rig).items())
-        click.echo(f"  distances, m: {pairs}")
+        options.tell(f"  distances, m: {pairs}")
     if record is not None:
         outliers = 0 if record.adjustment is None else record.adjustment.outliers
         left_out = f", {outliers} outliers left out" if outliers else ""
-        click.echo(f"  joint adjustment: {record.rms_px:.3f} px rms over all views{left_out}")
+        options.tell(f"  joint adjustment: {record.rms_px:.3f} px rms over all views{left_out}")
         _print_decisions(record)
     if rig.check is not None:
-        click.echo(f"  {rig.check.message}")
+        options.tell(f"  {rig.check.message}")
     if certificate is not None:
         if certificate.second_opinion is not None:
-            click.echo(f"  {opinion_text(certificate.second_opinion)}")
+            options.tell(f"  {opinion_text(certificate.second_opinion)}")
         for warning in certificate.warnings:
-            click.echo(f"  {warning}")
+            options.tell(f"  {warning}")
 
 
 def _volume_text(certificate: "Certificate") -> str:
@@ -473,10 +490,10 @@ def _counted(notes: Sequence[str]) -> list[str]:
 def _print_decisions(record: "CalibrationRecord") -> None:
     """Tell what was decided on the way: the world, symmetric boards, clocks."""
     if record.world is not None:
-        click.echo(f"  the world: {record.world.text}")
+        options.tell(f"  the world: {record.world.text}")
     labelling = record.labelling
     if labelling is not None and labelling.weakest_sigma is not None:
-        click.echo(
+        options.tell(
             "  the board looks the same turned; which way round each camera saw it was decided by "
             f"{labelling.decided_by}, by {labelling.weakest_sigma:.1f} standard deviations "
             f"or more{' (weak: compare a distance you know)' if labelling.is_weak else ''}"
@@ -490,4 +507,4 @@ def _print_decisions(record: "CalibrationRecord") -> None:
             for name, offset in clocks.offset_frames.items()
             if name != clocks.reference
         )
-        click.echo(f"  clocks, frames late against {clocks.reference}: {late}")
+        options.tell(f"  clocks, frames late against {clocks.reference}: {late}")

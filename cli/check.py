@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -27,7 +27,16 @@ _RIGS = {
 }
 
 
-@click.command(short_help="Look a session over before a long run.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["session"], values["scene"]),
+        writes=options.given(values["picture"]),
+    )
+
+
+@click.command(
+    cls=options.Command, files=_files, short_help="Look a session over before a long run."
+)
 @options.session_arg
 @click.option(
     "--scene",
@@ -99,7 +108,7 @@ def check(
         write_check_sheet(picture, look.session, look.masks)
     if as_json:
         told = {**to_json(found), "good": not found.problems}
-        click.echo(json.dumps(told))
+        options.tell(json.dumps(told))
     else:
         _tell(found)
     if found.problems or (strict and found.notes):
@@ -109,7 +118,7 @@ def check(
 def _tell(found: "SessionCheck") -> None:
     if found.cameras:
         rate = "" if found.fps is None else f", {found.fps:g} frames a second"
-        click.echo(f"{found.session}: {options.counted(len(found.cameras), 'camera')}{rate}")
+        options.tell(f"{found.session}: {options.counted(len(found.cameras), 'camera')}{rate}")
     _tell_files(found)
     _tell_looks(found)
     _tell_rig(found)
@@ -117,11 +126,11 @@ def _tell(found: "SessionCheck") -> None:
     if found.cost is not None:
         _tell_cost(found.cost)
     for text in found.problems:
-        click.echo(f"problem: {text}")
+        options.tell(f"problem: {text}")
     for text in found.notes:
-        click.echo(f"note: {text}")
+        options.tell(f"note: {text}")
     if not found.problems and not found.notes:
-        click.echo("nothing is wrong, as far as a look can tell")
+        options.tell("nothing is wrong, as far as a look can tell")
 
 
 def _tell_files(found: "SessionCheck") -> None:
@@ -144,7 +153,7 @@ def _tell_files(found: "SessionCheck") -> None:
     if len(rows) > 1:
         options.print_table(rows)
     if found.cameras and all(camera.recording is None for camera in found.cameras):
-        click.echo("no recording is named yet: there is nothing that detect could look at")
+        options.tell("no recording is named yet: there is nothing that detect could look at")
 
 
 def _frames_text(one: "SourceCheck") -> str:
@@ -162,7 +171,7 @@ def _frames_text(one: "SourceCheck") -> str:
 def _tell_looks(found: "SessionCheck") -> None:
     if not found.looks:
         return
-    click.echo("share of object pixels")
+    options.tell("share of object pixels")
     rows = [("frame", *map(str, found.frames))]
     for one in found.looks:
         shares = ("-" if share is None else f"{share:.1%}" for share in one.object_share)
@@ -170,7 +179,7 @@ def _tell_looks(found: "SessionCheck") -> None:
     options.print_table(rows)
     step = found.frames[-1] - found.frames[-2] if len(found.frames) > 1 else 1
     if found.cost is not None and found.cost.n_frames > found.frames[-1] + 2 * step:
-        click.echo(f"  what comes after frame {found.frames[-1]} was not looked at")
+        options.tell(f"  what comes after frame {found.frames[-1]} was not looked at")
 
 
 def _tell_rig(found: "SessionCheck") -> None:
@@ -182,19 +191,19 @@ def _tell_rig(found: "SessionCheck") -> None:
                 if has_board
                 else "name one with rig =, or record a board (extrinsics) and calibrate"
             )
-            click.echo(f"there is no rig yet: {way}")
+            options.tell(f"there is no rig yet: {way}")
         return
-    click.echo(f"rig: {_RIGS.get(found.rig, found.rig)}")
+    options.tell(f"rig: {_RIGS.get(found.rig, found.rig)}")
     if found.rig == "not looked at":
         return
     frames = options.counted(len(found.frames), "frame")
     if not found.agreement.is_told:
-        click.echo(f"on {frames} the cameras say too little about each other")
+        options.tell(f"on {frames} the cameras say too little about each other")
     elif not found.agreement.causes:
-        click.echo(f"on {frames} the cameras agree about each other")
+        options.tell(f"on {frames} the cameras agree about each other")
     else:
         told = "; ".join(cause.short for cause in found.agreement.causes)
-        click.echo(f"on {frames} the cameras say: {told}")
+        options.tell(f"on {frames} the cameras say: {told}")
 
 
 def _tell_scene(found: "SessionCheck") -> None:
@@ -215,7 +224,7 @@ def _tell_scene(found: "SessionCheck") -> None:
         )
     options.print_table(rows)
     if found.effects:
-        click.echo(f"effects: {', '.join(found.effects)} (`hybridve simulate`; detect has none)")
+        options.tell(f"effects: {', '.join(found.effects)} (`hybridve simulate`; detect has none)")
 
 
 def _tell_cost(cost: "Cost") -> None:
@@ -227,7 +236,7 @@ def _tell_cost(cost: "Cost") -> None:
     if cost.disk_bytes is not None:
         parts.append(f"report {max(cost.disk_bytes / 1e6, 0.1):.1f} MB")
     frames = options.counted(cost.n_frames, "frame")
-    click.echo(f"a run over {frames} will take, roughly: {', '.join(parts)}")
+    options.tell(f"a run over {frames} will take, roughly: {', '.join(parts)}")
 
 
 def _time_text(seconds: float) -> str:

@@ -32,7 +32,19 @@ def _decision(status: str, name: str, what: str) -> Callable[[options.FC], optio
     return click.option(f"--{name}", f"as_{status}", metavar="ID", multiple=True, help=what)
 
 
-@click.command(short_help="List what clashes, and keep what was decided about it.")
+def _files(values: dict[str, Any]) -> options.Files:
+    from hybridve.hull.report.ledger import ledger_path
+
+    report = values["report"]
+    ledger = values["ledger_file"] or ledger_path(report)
+    return options.Files(options.given(report, values["scene"]), held=[ledger])
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="List what clashes, and keep what was decided about it.",
+)
 @options.report_arg
 @_decision("approved", "approve", "The clash is as it may be; may be given several times.")
 @_decision("reviewed", "review", "Somebody looked at it; may be given several times.")
@@ -106,7 +118,7 @@ def clashes(
         keep_ledger(ledger, write_ledger, must_be=bool(wanted))
     gone = _gone(before, ledger)
     if as_json:
-        click.echo(json.dumps(_told(loaded, ledger, found, listed, gone)))
+        options.tell(json.dumps(_told(loaded, ledger, found, listed, gone)))
     else:
         _print(loaded, ledger, found, listed, gone)
     if fail_on_clash and not (
@@ -215,9 +227,9 @@ def _print(
     listed: "tuple[Listed, ...]",
     gone: list[str],
 ) -> None:
-    click.echo(_first_line(report, listed))
+    options.tell(_first_line(report, listed))
     gathered = options.counted(found.n_patches, "contact")
-    click.echo(
+    options.tell(
         f"{report.path}: {options.counted(len(report.index), 'frame')}; {gathered} of single "
         f"frames gathered into {counted_clashes(len(found.clashes))}"
     )
@@ -227,24 +239,24 @@ def _print(
     for one in listed:
         if one.entry.comment:
             by = f", {one.entry.who}" if one.entry.who else ""
-            click.echo(f"  {one.entry.id}: {one.entry.comment}{by}")
+            options.tell(f"  {one.entry.id}: {one.entry.comment}{by}")
         if one.ties:
             names = " or ".join(one.ties[:_MOST_NAMES])
-            click.echo(f"  {one.entry.id}: lies beside {names}, and could be taken for it")
+            options.tell(f"  {one.entry.id}: lies beside {names}, and could be taken for it")
     for left in found.left_out:
-        click.echo(
+        options.tell(
             f"  rule {left.number} left out {counted_clashes(left.clashes)} in "
             f"{options.counted(left.frames, 'frame')}: {left.rule.text}"
         )
     if gone:
         more = ", ..." if len(gone) > _MOST_NAMES else ""
-        click.echo(f"  no longer found, so resolved: {', '.join(gone[:_MOST_NAMES])}{more}")
+        options.tell(f"  no longer found, so resolved: {', '.join(gone[:_MOST_NAMES])}{more}")
     if found.frames_undecided:
         counts = ", ".join(f"{n} {verdict}" for verdict, n in found.frames_undecided.items())
-        click.echo(
+        options.tell(
             f"  not decided, frames of all objects together: {counts}; see `hybridve summary`"
         )
-    click.echo(f"  ids and decisions: {ledger.path}")
+    options.tell(f"  ids and decisions: {ledger.path}")
 
 
 def _first_line(report: "Report", listed: "tuple[Listed, ...]") -> str:

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import click
 
@@ -33,7 +33,18 @@ class ImageSize(click.ParamType[tuple[int, int]]):
         return int(width), int(height)
 
 
-@click.command(short_help="Take a rig from one program's files to another's.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["rig"]),
+        writes=options.given(values["output"]),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Take a rig from one program's files to another's.",
+)
 @click.argument("rig", type=click.Path(path_type=Path))
 @options.output_option(
     "The file to write; for colmap a folder; for opencv a path with {camera} in it."
@@ -102,6 +113,7 @@ def convert(
     """
     from hybridve.calib.formats.rig_export import export_rig, output_files
     from hybridve.calib.formats.rigs import read_any_rig
+    from hybridve.hull.places import Inputs
     from hybridve.hull.report.write import refuse_existing
 
     found = read_any_rig(
@@ -111,9 +123,11 @@ def convert(
         image_sizes=image_size,
         names=cameras,
     )
+    inputs = Inputs.of([rig])
     for path in output_files(found, to, output):
         if path.parent.is_dir() or to not in {"colmap", "opencv"}:  # those make folders
             refuse_existing(path, overwrite=overwrite)
+        inputs.refuse(path)
     written = export_rig(found, to, output, unit=unit, approximate_lenses=approximate)
     if as_json:
         numbers = {
@@ -124,11 +138,11 @@ def convert(
             "approximated": written.approximated,
             "lost": list(written.lost),
         }
-        click.echo(json.dumps(numbers))
+        options.tell(json.dumps(numbers))
         return
     count = options.counted(len(found.cameras), "camera")
-    click.echo(f"{output}: {count} as {to}, {options.counted(len(written.files), 'file')}")
+    options.tell(f"{output}: {count} as {to}, {options.counted(len(written.files), 'file')}")
     for name, lens in written.approximated.items():
-        click.echo(f"  {name}: {lens['model']} instead, up to {lens['error_px']:.3g} px off")
+        options.tell(f"  {name}: {lens['model']} instead, up to {lens['error_px']:.3g} px off")
     for what in written.lost:
-        click.echo(f"  left behind: {what}")
+        options.tell(f"  left behind: {what}")

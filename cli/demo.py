@@ -16,7 +16,16 @@ from hybridve.cli.summary import summary
 from hybridve.cli.synth import synth
 
 
-@click.command(short_help="The whole job on a generated recording.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(),
+        writes=options.given(values["output"]),
+    )
+
+
+@click.command(
+    cls=options.Command, files=_files, short_help="The whole job on a generated recording."
+)
 @click.option(
     "-o",
     "--output",
@@ -44,7 +53,7 @@ def demo(context: click.Context, output: Path, overwrite: bool, progress: bool) 
     output.mkdir(parents=True, exist_ok=True)
 
     def step(text: str, command: click.Command, **values: Any) -> None:
-        click.echo(f"$ hybridve {text}", err=True)
+        options.tell(f"$ hybridve {text}", err=True)
         context.invoke(command, **values)
 
     again: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
@@ -71,4 +80,4 @@ def demo(context: click.Context, output: Path, overwrite: bool, progress: bool) 
     shown = f"render {session} --scene {scene} --report {report}"
     step(f"{shown} -o {picture}", render, output=picture, **drawn)
     step(f"{shown} --view cameras -o {seen}", render, output=seen, view="cameras", **drawn)
-    click.echo(f"report   {report}\ncurves   {curves}\npicture  {picture}\ncameras  {seen}")
+    options.tell(f"report   {report}\ncurves   {curves}\npicture  {picture}\ncameras  {seen}")

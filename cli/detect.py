@@ -19,7 +19,19 @@ if TYPE_CHECKING:
 COMPARISON = "COMPARISON.csv"
 
 
-@click.command(cls=options.GroupedCommand, short_help="Find what recordings touched, into reports.")
+def _files(values: dict[str, Any]) -> options.Files:
+    sessions, scenes, output = values["sessions"], values["scenes"], values["output"]
+    is_one = len(sessions) == len(scenes) == 1
+    return options.Files(
+        reads=options.given(sessions, scenes), writes=[output if is_one else output / COMPARISON]
+    )
+
+
+@click.command(
+    cls=options.GroupedCommand,
+    files=_files,
+    short_help="Find what recordings touched, into reports.",
+)
 @options.sessions_arg
 @options.scenes_option
 @options.output_option(
@@ -148,7 +160,7 @@ def detect(
         report = read_report(output)
         found = [summarize(report)]
         if as_json:
-            click.echo(json.dumps(found[0]))
+            options.tell(json.dumps(found[0]))
         else:
             print_summary(report)
     if fail_on_doubt and not all(numbers["trusted"] for numbers in found):
@@ -175,9 +187,9 @@ def _tell_all(table: Path, pairs: "list[Pair]", *, as_json: bool) -> None:
     comparison = compare(pairs)
     write_comparison(table, comparison)
     if as_json:
-        click.echo(json.dumps({"comparison": str(table), **comparison}))
+        options.tell(json.dumps({"comparison": str(table), **comparison}))
     else:
-        _print_comparison(table, comparison)
+        print_comparison(table, comparison)
     if comparison["failed"]:
         raise ReportError(
             f"{table.parent}: {len(comparison['failed'])} of {len(pairs)} reports could not be "
@@ -186,7 +198,7 @@ def _tell_all(table: Path, pairs: "list[Pair]", *, as_json: bool) -> None:
         )
 
 
-def _print_comparison(table: Path, comparison: dict[str, Any]) -> None:
+def print_comparison(table: Path, comparison: dict[str, Any]) -> None:
     """Print sessions in columns; layouts and objects in rows."""
     sessions = comparison["sessions"]
     rows = [("layout", "object", *sessions)]
@@ -194,7 +206,7 @@ def _print_comparison(table: Path, comparison: dict[str, Any]) -> None:
         cells = (_cell_text(row["sessions"].get(name)) for name in sessions)
         rows.append((row["layout"], row["object"], *cells))
     layouts = options.counted(len(comparison["layouts"]), "layout")
-    click.echo(f"{table}: {options.counted(len(sessions), 'session')}, {layouts}")
+    options.tell(f"{table}: {options.counted(len(sessions), 'session')}, {layouts}")
     options.print_table(rows)
 
 

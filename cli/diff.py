@@ -43,21 +43,21 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
             "comparisons": [told_of_comparison(one) for one in compared],
             "not_compared": [str(path) for path in alone],
         }
-        click.echo(json.dumps(told))
+        options.tell(json.dumps(told))
     else:
         for one in compared:
             _print(one)
         for path in alone:
-            click.echo(f"{path}: the other folder has no such report")
+            options.tell(f"{path}: the other folder has no such report")
     if any(one.is_worse for one in compared):
         sys.exit(6)
 
 
 def _print(comparison: "Comparison") -> None:
-    click.echo(_first_line(comparison))
-    click.echo(f"{comparison.old} -> {comparison.new}: {_basis(comparison)}")
+    options.tell(_first_line(comparison))
+    options.tell(f"{comparison.old} -> {comparison.new}: {_basis(comparison)}")
     for path in comparison.distrusted:
-        click.echo(f"  {path} is not to be trusted: its cameras contradict each other")
+        options.tell(f"  {path} is not to be trusted: its cameras contradict each other")
     rows: list[tuple[str, ...]] = [
         ("id", "change", "object", "by, mm", "counts beyond, mm", "before, mm", "now, mm")
     ]

@@ -89,20 +89,20 @@ def doctor(prepare: bool, as_json: bool) -> None:
         found["compiled"] = True
     found["prepare_s"] = prepare_s
     if as_json:
-        click.echo(json.dumps(found))
+        options.tell(json.dumps(found))
     else:
-        click.echo(f"machine    {found['machine']}")
-        click.echo(f"opengl     {found['opengl'] or 'none'}")
+        options.tell(f"machine    {found['machine']}")
+        options.tell(f"opengl     {found['opengl'] or 'none'}")
         engine = f"{found['engine']} (what --engine auto takes here)"
-        click.echo(f"engine     {engine if found['engine'] else 'none'}")
+        options.tell(f"engine     {engine if found['engine'] else 'none'}")
         ready = "compiled" if found["compiled"] else "compiled in the first detect, or by --prepare"
-        click.echo(f"query      {ready}" + (f" ({prepare_s:.1f} s)" if prepare_s else ""))
+        options.tell(f"query      {ready}" + (f" ({prepare_s:.1f} s)" if prepare_s else ""))
         for package, number in found["versions"].items():
-            click.echo(f"{package:24}{number}")
+            options.tell(f"{package:24}{number}")
         for problem in found["problems"]:
-            click.echo(f"problem    {problem}")
+            options.tell(f"problem    {problem}")
         if not found["problems"]:
-            click.echo("nothing is missing")
+            options.tell("nothing is missing")
     if found["problems"]:
         sys.exit(1)
 

@@ -1,7 +1,7 @@
 """``hybridve export``: a report as a page, as tables, as meshes, for other programs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -27,7 +27,19 @@ _TARGETS = (
 _path = click.Path(path_type=Path)
 
 
-@click.command(short_help="Write a report as a page, or for other programs.")
+def _files(values: dict[str, Any]) -> options.Files:
+    targets = ("html", "csv", "bcf", "hull_mesh", "vtk")
+    return options.Files(
+        reads=options.given(values["report"], values["session"], values["ledger_file"]),
+        writes=options.given(*(values[target] for target in targets)),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Write a report as a page, or for other programs.",
+)
 @click.argument("report", type=_path, required=False)
 @click.option(
     "--html",
@@ -147,7 +159,7 @@ def export(
 
         why = write_clashes_bcf(bcf, loaded, listed, recorded=recorded, progress=terminal.stage)
         without = f", without pictures: {why}" if why else ""
-        click.echo(f"{bcf}: {options.counted(len(listed), 'topic')}{without}")
+        options.tell(f"{bcf}: {options.counted(len(listed), 'topic')}{without}")
     if hull_mesh is not None:
         from hybridve.hull.export_hulls import write_hull_meshes
 
@@ -162,14 +174,14 @@ def export(
             progress=terminal.stage,
         )
         meshes = "1 mesh" if count == 1 else f"{count} meshes"
-        click.echo(f"{hull_mesh}: {meshes} of {options.counted(len(loaded.index), 'frame')}")
+        options.tell(f"{hull_mesh}: {meshes} of {options.counted(len(loaded.index), 'frame')}")
     if vtk is not None:
         from hybridve.hull.export_hulls import write_paraview
 
         write_paraview(
             vtk, loaded, recorded=recorded, cell_m=cell_mm / 1e3, progress=terminal.stage
         )
-        click.echo(f"{vtk}: {options.counted(len(loaded.index), 'frame')}")
+        options.tell(f"{vtk}: {options.counted(len(loaded.index), 'frame')}")
     if html is not None:
         from hybridve.hull.page import write_page
 
@@ -182,7 +194,7 @@ def export(
             missing=missing,
             progress=terminal.stage,
         )
-        click.echo(f"{html}: {size / 1e6:.1f} MB, {options.counted(len(loaded.index), 'frame')}")
+        options.tell(f"{html}: {size / 1e6:.1f} MB, {options.counted(len(loaded.index), 'frame')}")
 
 
 def _refuse_wrong_usage(
@@ -256,8 +268,8 @@ def _write_tables(
     frames.parent.mkdir(parents=True, exist_ok=True)
     write_tables(frames, clashes, report, listed)
     n_rows = len(report.index) * len(report.objects)
-    click.echo(f"{frames}: {options.counted(n_rows, 'row')}, a frame and object each")
-    click.echo(f"{clashes}: {options.counted(len(listed), 'row')}, a clash each")
+    options.tell(f"{frames}: {options.counted(n_rows, 'row')}, a frame and object each")
+    options.tell(f"{clashes}: {options.counted(len(listed), 'row')}, a clash each")
 
 
 def _clashes(report: "Report", ledger_file: Path | None) -> "tuple[Clashes, tuple[Listed, ...]]":

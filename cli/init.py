@@ -26,13 +26,13 @@ def init(folder: Path) -> None:
 
     found, files = write_drafts(folder)
     for path in files:
-        click.echo(str(path))
+        options.tell(str(path))
     for name, table in found.cameras.items():
         keys = (key or f"{find.pattern} (what for?)" for key, find in table.items())
-        click.echo(f"  camera {name}: {', '.join(keys)}")
-    click.echo(f"  {options.counted(len(found.cad), 'CAD file')}")
+        options.tell(f"  camera {name}: {', '.join(keys)}")
+    options.tell(f"  {options.counted(len(found.cad), 'CAD file')}")
     if found.left:
-        click.echo(f"  not known what for: {', '.join(find.pattern for find in found.left)}")
+        options.tell(f"  not known what for: {', '.join(find.pattern for find in found.left)}")
     open_keys = [
         f"{path.name}:{number}"
         for path in files
@@ -40,5 +40,5 @@ def init(folder: Path) -> None:
         if f'"{FILL_IN}"' in line
     ]
     if open_keys:
-        click.echo(f"to be filled in: {', '.join(open_keys)}")
-    click.echo(f"then: hybridve check {folder}")
+        options.tell(f"to be filled in: {', '.join(open_keys)}")
+    options.tell(f"then: hybridve check {folder}")

@@ -2,11 +2,14 @@
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import click
 
+from hybridve.calib.bounded import printable
 from hybridve.hull.report.wording import counted as counted
 
 EngineName = Literal["auto", "compute", "native", "stencil", "reference"]
@@ -53,6 +56,81 @@ class Frames(click.ParamType["FrameRange"]):
             )
 
 
+@dataclass(frozen=True, slots=True)
+class Files:
+    """What a command reads and writes, by its arguments.
+
+    Attributes
+    ----------
+    reads : list of Path
+        Sessions, scenes, rigs, reports and folders of them.
+    writes : list of Path
+        Files and folders; each is held while the command runs, so that no other run writes it.
+    keeps : list of Path
+        Those that the session itself keeps, as its rig, which a command makes anew.
+    held : list of Path
+        Those that are read, changed and written in a moment: who comes second waits for them.
+    """
+
+    reads: list[Path] = field(default_factory=list)
+    writes: list[Path] = field(default_factory=list)
+    keeps: list[Path] = field(default_factory=list)
+    held: list[Path] = field(default_factory=list)
+
+
+#: How long one waits for a file that another run changes in a moment, in seconds.
+_PATIENCE_S = 10.0
+
+
+class Command(click.Command):
+    """A command that never writes over what it reads, nor what another run is writing.
+
+    Parameters
+    ----------
+    files : callable
+        Returns what it reads and writes, asked for the values of its parameters by their names.
+    """
+
+    def __init__(
+        self, *args: Any, files: Callable[[dict[str, Any]], Files] | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self._files = files
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run it, its outputs held."""
+        if self._files is None:
+            return super().invoke(ctx)
+        from hybridve.calib.holding import holding
+        from hybridve.hull.places import Inputs
+
+        files = self._files(ctx.params)
+        inputs = Inputs.of(files.reads)
+        with ExitStack() as held:
+            # Without --overwrite nothing that stands is written over.
+            may_overwrite = ctx.params.get("overwrite", True)
+            for path in files.writes if may_overwrite else ():
+                inputs.refuse(path)
+            for path in files.keeps if may_overwrite else ():
+                inputs.refuse(path, is_kept_here=True)
+            for path in dict.fromkeys([*files.writes, *files.keeps]):
+                held.enter_context(holding(path, command_line()))
+            for path in files.held:
+                held.enter_context(holding(path, command_line(), patience_s=_PATIENCE_S))
+            return super().invoke(ctx)
+
+
+def given(*paths: Path | Sequence[Path] | None) -> list[Path]:
+    """Return those paths that are given."""
+    found: list[Path] = []
+    for path in paths:
+        if isinstance(path, Path):
+            found.append(path)
+        elif path is not None:
+            found.extend(path)
+    return found
+
+
 class GroupedOption(click.Option):
     """An option that help shows under a heading of its own; see `GroupedCommand`."""
 
@@ -61,7 +139,7 @@ class GroupedOption(click.Option):
         self.heading = heading
 
 
-class GroupedCommand(click.Command):
+class GroupedCommand(Command):
     """A command whose help shows its options under headings, in the order in which they come."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -279,9 +357,14 @@ def command_line() -> str:
     return " ".join(["hybridve", *sys.argv[1:]])
 
 
+def tell(text: str = "", *, err: bool = False) -> None:
+    """Print a text, with nothing in it that a terminal would obey: names come from strangers."""
+    click.echo(printable(text), err=err)
+
+
 def print_table(rows: Sequence[Sequence[str]]) -> None:
     """Print rows of cells in columns, indented; the first row is the heading."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        click.echo("  " + "  ".join(cells).rstrip())
+        tell("  " + "  ".join(cells).rstrip())

@@ -84,7 +84,7 @@ def plan(
                 {"key": key, "value": value, **to_json(account)}
                 for value, account in zip(values, accounts, strict=True)
             ]
-        click.echo(json.dumps(told))
+        options.tell(json.dumps(told))
     elif key:
         _tell_rows(key, values, accounts)
     else:
@@ -92,7 +92,7 @@ def plan(
 
 
 def _tell(found: "PlanAccount") -> None:
-    click.echo(f"{found.plan}: {options.counted(len(found.cameras), 'camera')}")
+    options.tell(f"{found.plan}: {options.counted(len(found.cameras), 'camera')}")
     rows = [("camera", "at, m", "to the middle, m", "mm a pixel", "volume seen", "square, px")]
     for one in found.cameras:
         rows.append(
@@ -106,11 +106,13 @@ def _tell(found: "PlanAccount") -> None:
             )
         )
     options.print_table(rows)
-    click.echo(
+    options.tell(
         f"of the volume {found.seen_by_all:.0%} is seen by all cameras, {found.seen_by_two:.0%} by "
         "two or more"
     )
-    click.echo(f"a ball of {found.ball_radius_mm:g} mm radius beside a plate, all over the volume:")
+    options.tell(
+        f"a ball of {found.ball_radius_mm:g} mm radius beside a plate, all over the volume:"
+    )
     options.print_table(
         [
             ("mm", "median", "95 % of places", "most"),
@@ -120,13 +122,13 @@ def _tell(found: "PlanAccount") -> None:
             ("both: what a part must be farther away", *_texts(found.total_mm)),
         ]
     )
-    click.echo(
+    options.tell(
         f"a hand moves {found.blur_mm:.1f} mm while the shutter is open, "
         f"{found.out_of_step_mm:.1f} mm between cameras, {found.between_frames_mm:.0f} mm from "
         "frame to frame"
     )
     for note in found.notes:
-        click.echo(f"note: {note}")
+        options.tell(f"note: {note}")
 
 
 def _tell_rows(key: str, values: tuple[str, ...], accounts: list["PlanAccount"]) -> None:
@@ -145,9 +147,9 @@ def _tell_rows(key: str, values: tuple[str, ...], accounts: list["PlanAccount"])
             )
         )
     options.print_table(rows)
-    click.echo("medians over the volume; the last column holds for 95 % of places and sides")
+    options.tell("medians over the volume; the last column holds for 95 % of places and sides")
     for note in dict.fromkeys(note for found in accounts for note in found.notes):
-        click.echo(f"note: {note}")
+        options.tell(f"note: {note}")
 
 
 def _texts(spread: "Spread") -> tuple[str, str, str]:

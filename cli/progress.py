@@ -4,8 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import click
-
+from hybridve.cli.options import tell
 from hybridve.hull.watcher import Advance
 
 #: Seconds between two lines where stderr is a file and not a terminal.
@@ -64,4 +63,4 @@ class Terminal:
 
     def warn(self, text: str) -> None:
         """Show a line in any case."""
-        click.echo(text, err=True)
+        tell(text, err=True)

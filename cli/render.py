@@ -54,7 +54,18 @@ class Size(click.ParamType[tuple[int, int]]):
         return width, height
 
 
-@click.command(short_help="Draw one frame, or a film: cameras, hull, CAD, collisions in red.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["session"], values["scene"], values["report"], values["sim"]),
+        writes=options.given(values["output"]),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Draw one frame, or a film: cameras, hull, CAD, collisions in red.",
+)
 @options.session_arg
 @options.scene_option
 @options.output_option("The picture to write, a .png or .jpg; or a film, .mp4.")
@@ -273,7 +284,7 @@ class _Job:
         chain = self._chain(session, scene, None, doubt)
         if view == "agreement":
             write_picture(output, draw_agreement(chain, index, causes))
-            click.echo(f"{output}: frame {index}")
+            options.tell(f"{output}: frame {index}")
             return
         with open_engine(self._engine) as query:
             shot = take_shot(chain, index, query)
@@ -283,7 +294,7 @@ class _Job:
         picture = draw_cameras(shot, look) if sheet else self._drawn(chain, shot, look)
         write_picture(output, picture)
         said = "" if told is None else f"; {told.text()}"
-        click.echo(f"{output}: frame {index}{said}")
+        options.tell(f"{output}: frame {index}{said}")
 
     def film(self, session: Path, scene: Path, output: Path, frames: "FrameRange | None") -> None:
         """Draw many frames, one after another."""
@@ -329,7 +340,7 @@ class _Job:
             f"{span.heading or 'frames'} {span.frames.start}:{span.frames.stop or ''}"
             for span in spans
         )
-        click.echo(f"{output}: {options.counted(count, 'frame')} ({said})")
+        options.tell(f"{output}: {options.counted(count, 'frame')} ({said})")
 
     def _chain(
         self, session: Path, scene: Path, frames: "FrameRange | None", doubt: Any = None
@@ -501,7 +512,7 @@ def _render_simulation(
     if output.suffix.lower() in FILMS:
         fps = chain.session.fps / frames.step
         count = write_film(output, draw_film(chain, simulation, _FILM_PX), fps)
-        click.echo(f"{output}: {options.counted(count, 'frame')}")
+        options.tell(f"{output}: {options.counted(count, 'frame')}")
         return
     if frame is None:
         met = np.sum([one.values["n_contacts"] for one in simulation.groups.values()], axis=0)
@@ -510,7 +521,7 @@ def _render_simulation(
     if not len(rows):
         raise ReportError(f"{sim}: has no frame {frame}")
     write_picture(output, draw_frame(chain, simulation, int(rows[0]), _PICTURE_PX))
-    click.echo(f"{output}: frame {frame}")
+    options.tell(f"{output}: frame {frame}")
 
 
 def _middle_frame(report: "Report", causes: "Sequence[NamedCause]") -> int:

@@ -16,7 +16,23 @@ if TYPE_CHECKING:
     from hybridve.hull.quality import Scored
 
 
-@click.command(short_help="Cut the real things out of the recording.")
+def _folder(session: Path) -> Path:
+    return session if session.is_dir() else session.parent
+
+
+def _files(values: dict[str, Any]) -> options.Files:
+    session = values["session"]
+    mine = _folder(session) / "silhouettes.h5"
+    return options.Files(
+        reads=[session],
+        keeps=[mine, mine.with_suffix(".html")],
+        writes=options.given(values["film"]),
+    )
+
+
+@click.command(
+    cls=options.Command, files=_files, short_help="Cut the real things out of the recording."
+)
 @options.session_arg
 @click.option(
     "--unconfirmed/--no-unconfirmed",
@@ -88,7 +104,7 @@ def segment(
     terminal = Terminal(enabled=progress)
     if ignored and evaluate is None:
         raise click.UsageError("--ignore goes with --evaluate")
-    folder = session if session.is_dir() else session.parent
+    folder = _folder(session)
     output = folder / "silhouettes.h5"
     loaded, *_ = ask_all(
         lambda: opened_session(session),
@@ -154,25 +170,25 @@ def _print_json(
         told["scores"] = {name: _numbers(one) for name, one in _by_camera(scored).items()} | {
             "mean_iou": sum(one.score.iou for one in scored) / len(scored)
         }
-    click.echo(json.dumps(told))
+    options.tell(json.dumps(told))
 
 
 def _print(found: "Segmented", page: Path | None, n_looks: int | None, film: Path | None) -> None:
     n_invalid = sum(bool(why) for why in found.reasons)
-    click.echo(
+    options.tell(
         f"{found.path}: {len(found.reasons)} frames, {n_invalid} without all cameras, "
         f"{found.path.stat().st_size / 1e6:.1f} MB"
     )
     for name, share in _shares(found).items():
-        click.echo(f"  {name}: {share:.1%} of the picture is object, on average")
+        options.tell(f"  {name}: {share:.1%} of the picture is object, on average")
     trust = "" if found.agreement.is_trusted else "not to be trusted: "
     for cause in found.agreement.causes:
-        click.echo(f"  {trust if cause.is_gross else ''}{cause.message}")
+        options.tell(f"  {trust if cause.is_gross else ''}{cause.message}")
     if page is not None:
         first = f": {n_looks} frames to look at first" if n_looks else ""
-        click.echo(f"{page}{first}")
+        options.tell(f"{page}{first}")
     if film is not None:
-        click.echo(f"{film}")
+        options.tell(f"{film}")
 
 
 def _by_camera(scored: "Sequence[Scored]") -> dict[str, "Scored"]:
@@ -199,12 +215,12 @@ def _numbers(one: "Scored") -> dict[str, float]:
 def _print_scores(scored: "Sequence[Scored]") -> None:
     if not scored:
         return
-    click.echo(f"against {len(scored)} masks made by hand:")
+    options.tell(f"against {len(scored)} masks made by hand:")
     for name, one in _by_camera(scored).items():
         score = one.score
-        click.echo(
+        options.tell(
             f"  {name}: IoU {score.iou:.3f}, F1 {score.f1:.3f}, precision {score.precision:.3f}, "
             f"recall {score.recall:.3f}"
         )
     mean = sum(one.score.iou for one in scored) / len(scored)
-    click.echo(f"  mean IoU of the masks: {mean:.3f}")
+    options.tell(f"  mean IoU of the masks: {mean:.3f}")

@@ -15,7 +15,18 @@ if TYPE_CHECKING:
     from hybridve.hull.effects.instants import HullMode
 
 
-@click.command(short_help="Simulate the effects that a scene names, beside a recording.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["session"], values["scene"]),
+        writes=options.given(values["output"], values["picture"]),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Simulate the effects that a scene names, beside a recording.",
+)
 @options.session_arg
 @options.scene_option
 @options.output_option("The file to write, SIM.h5.")
@@ -127,25 +138,25 @@ def tell_simulation(path: Path, picture: Path | None, *, as_json: bool) -> None:
     numbers = summarize_simulation(simulation)
     if as_json:
         named = {} if picture is None else {"picture": str(picture)}
-        click.echo(json.dumps({**numbers, **named}))
+        options.tell(json.dumps({**numbers, **named}))
         return
     _print(numbers)
     if picture is not None:
-        click.echo(f"  energy and penetration against time: {picture}")
+        options.tell(f"  energy and penetration against time: {picture}")
 
 
 def _print(numbers: dict[str, Any]) -> None:
-    click.echo(
+    options.tell(
         f"{numbers['simulation']}: {options.counted(numbers['frames'], 'frame')}, "
         f"{numbers['seconds']:.2f} s, {options.counted(numbers['steps'], 'step')}"
         + ("" if numbers["trusted"] else "; not to be trusted: the cameras contradict each other")
     )
     for cause in numbers["causes"]:
-        click.echo(f"  {cause['message']}")
+        options.tell(f"  {cause['message']}")
     if numbers["frames_paused"]:
-        click.echo(f"  paused in {options.counted(numbers['frames_paused'], 'frame')}:")
+        options.tell(f"  paused in {options.counted(numbers['frames_paused'], 'frame')}:")
         for reason, count in numbers["reasons"].items():
-            click.echo(f"    {count} x {reason}")
+            options.tell(f"    {count} x {reason}")
     rows = [
         (
             "effect",
@@ -173,8 +184,8 @@ def _print(numbers: dict[str, Any]) -> None:
     options.print_table(rows)
     for found in numbers["effects"]:
         for line in found["notes"]:
-            click.echo(f"  {found['name']}: {line}")
+            options.tell(f"  {found['name']}: {line}")
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in numbers["stage_ms_mean"].items())
-    click.echo(f"  ms of work a frame besides, mean: {stages}")
+    options.tell(f"  ms of work a frame besides, mean: {stages}")
     if numbers["stopped"]:
-        click.echo(f"  stopped: {numbers['stopped']}")
+        options.tell(f"  stopped: {numbers['stopped']}")

@@ -39,8 +39,16 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["sessions"], values["scene"]),
+        writes=options.given(values["output"], values["picture"]),
+    )
+
+
 @click.command(
     cls=options.GroupedCommand,
+    files=_files,
     short_help="Find how far to move an object for a recorded task to have room.",
 )
 @options.sessions_arg
@@ -187,7 +195,7 @@ def spacing(
             "spacing": None if output is None else str(output),
             "picture": None if picture is None else str(picture),
         }
-        click.echo(json.dumps({**files, **spacing_as_dict(result)}))
+        options.tell(json.dumps({**files, **spacing_as_dict(result)}))
     else:
         _print_result(result)
     if fail_on_doubt and not all(one.agreement.is_trusted for one in result.sessions):
@@ -228,7 +236,7 @@ def _print_result(found: "Spacing") -> None:
     settings = found.settings
     direction = ", ".join(f"{value:.3g}" for value in settings["direction"])
     required = dict.fromkeys(f"{1e3 * one:g}" for one in settings["required_m"])
-    click.echo(
+    options.tell(
         f"{', '.join(settings['move'])} moved along ({direction}), {1e3 * settings['start_m']:g} "
         f"to {1e3 * settings['stop_m']:g} mm, to keep {', '.join(required)} mm"
         + (f", silhouettes grown by {settings['grow_px']} px" if settings["grow_px"] else "")
@@ -236,7 +244,7 @@ def _print_result(found: "Spacing") -> None:
     for one in found.sessions:
         trust = "" if one.agreement.is_trusted else "not to be trusted: "
         for cause in one.agreement.causes:
-            click.echo(f"{one.name}: {trust if cause.is_gross else ''}{cause.message}")
+            options.tell(f"{one.name}: {trust if cause.is_gross else ''}{cause.message}")
     columns = [_column(one) for one in found.sessions]
     labels = [label for label in columns[0] if any(column[label] for column in columns)]
     rows = [("mm", *(one.name for one in found.sessions))]
@@ -244,7 +252,7 @@ def _print_result(found: "Spacing") -> None:
     options.print_table(rows)
     standing = _standing_text(found)
     if standing:
-        click.echo(standing)
+        options.tell(standing)
 
 
 def _column(one: "SessionSpacing") -> dict[str, str]:

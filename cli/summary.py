@@ -23,7 +23,18 @@ _MOST_WHY = 3
 _MOST_NAMES = 8
 
 
-@click.command(short_help="Tell what a report found.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(values["report"]),
+        writes=options.given(values["picture"]),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Tell what a report found.",
+)
 @options.report_arg
 @options.json_option
 @click.option(
@@ -60,11 +71,11 @@ def summary(report: Path, as_json: bool, picture: Path | None, overwrite: bool) 
         write_curves(picture, loaded)
     if as_json:
         named = {} if picture is None else {"picture": str(picture)}
-        click.echo(json.dumps({**summarize(loaded), **named}))
+        options.tell(json.dumps({**summarize(loaded), **named}))
         return
     print_summary(loaded)
     if picture is not None:
-        click.echo(f"  clearance against time: {picture}")
+        options.tell(f"  clearance against time: {picture}")
 
 
 def _refuse_picture(picture: Path, *, overwrite: bool) -> None:
@@ -81,25 +92,25 @@ def print_summary(report: "Report") -> None:
 
     numbers = summarize(report)
     clashes = gather_clashes(report, rules=()).clashes
-    click.echo(overall_text(numbers, clashes))
+    options.tell(overall_text(numbers, clashes))
     about = f"{numbers['report']}: {numbers['frames']} frames, {numbers['seconds']:.2f} s"
     if clashes:
         about += f"; `hybridve clashes` tells of {counted_clashes(len(clashes))}"
-    click.echo(about)
+    options.tell(about)
     _print_causes(numbers["causes"])
     if numbers["frames_invalid"]:
         invalid = options.counted(numbers["frames_invalid"], "frame")
-        click.echo(f"  {invalid} could not be evaluated:")
+        options.tell(f"  {invalid} could not be evaluated:")
         for reason, count in numbers["reasons"].items():
             frames = numbers["reason_frames"][reason]
             shown = ", ".join(map(str, frames[:_MOST_NAMES]))
             more = ", ..." if count > _MOST_NAMES else ""
-            click.echo(f"    {count} x {reason} (frame {shown}{more})")
+            options.tell(f"    {count} x {reason} (frame {shown}{more})")
     if numbers["frames_without_hull"]:
         empty = options.counted(numbers["frames_without_hull"], "frame")
-        click.echo(f"  {empty} without a hull near any object, in which nothing can be touched")
+        options.tell(f"  {empty} without a hull near any object, in which nothing can be touched")
     for why, count in numbers["rests_on"].items():
-        click.echo(f"    {count} x {why}")
+        options.tell(f"    {count} x {why}")
     rows = [("object", "verdict", "frames", "certain", "when", *_MOST_OF_A_FRAME)]
     for found in numbers["objects"]:
         rows.append(
@@ -120,7 +131,7 @@ def print_summary(report: "Report") -> None:
     for found in numbers["objects"]:
         _print_entries(found)
         for line in _warnings(found):
-            click.echo(f"  {found['name']}: {line}")
+            options.tell(f"  {found['name']}: {line}")
     is_open = [
         found["name"]
         for found in numbers["objects"]
@@ -128,19 +139,19 @@ def print_summary(report: "Report") -> None:
     ]
     if is_open:
         more = f" and {len(is_open) - _MOST_NAMES} more" if len(is_open) > _MOST_NAMES else ""
-        click.echo(
+        options.tell(
             "  not closed, so that nobody can tell whether something is wholly inside: "
             f"{', '.join(is_open[:_MOST_NAMES])}{more}"
         )
     if numbers["sample_spacing_m"] is not None:
         smallest, largest = numbers["viewports"]
         viewports = f"viewport {largest}" if smallest == largest else f"{smallest} to {largest}"
-        click.echo(
+        options.tell(
             f"  sampled at most {numbers['sample_spacing_m'] * 1e3:.3g} mm apart along edges: "
             f"{viewports}, {numbers['samples']} samples"
         )
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in numbers["stage_ms_mean"].items())
-    click.echo(f"  ms of work a frame, mean: {stages}; engine {numbers['engine']}")
+    options.tell(f"  ms of work a frame, mean: {stages}; engine {numbers['engine']}")
 
 
 def _print_causes(causes: list[dict[str, Any]]) -> None:
@@ -150,15 +161,15 @@ def _print_causes(causes: list[dict[str, Any]]) -> None:
         if cause["kind"] == "frames":
             alone.setdefault(cause["cameras"][0], []).append(cause)
         else:
-            click.echo(f"  {cause['message']}")
+            options.tell(f"  {cause['message']}")
     for camera, runs in alone.items():
         if len(runs) == 1:
-            click.echo(f"  {runs[0]['message']}")
+            options.tell(f"  {runs[0]['message']}")
             continue
         spans = [(run["first_frame"], run["last_frame"]) for run in runs]
         shown = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in spans[:_MOST_NAMES])
         more = ", ..." if len(spans) > _MOST_NAMES else ""
-        click.echo(
+        options.tell(
             f"  {camera}'s silhouettes fit none of the others in {len(runs)} runs of frames "
             f"({shown}{more}); look at them (`hybridve render --view agreement`)"
         )
@@ -229,9 +240,11 @@ def _print_entries(found: dict[str, Any]) -> None:
         if status := span.get("first_contact_status"):
             text += f" ({status})"
         text += _speed_text(*span.get("approach_m_s", (None, None)))
-        click.echo(f"  {found['name']}: {text}")
+        options.tell(f"  {found['name']}: {text}")
     if len(spans) > _MOST_ENTRIES and "first_contact_s" in spans[0]:
-        click.echo(f"  {found['name']}: {len(spans) - _MOST_ENTRIES} more times; --json tells all")
+        options.tell(
+            f"  {found['name']}: {len(spans) - _MOST_ENTRIES} more times; --json tells all"
+        )
 
 
 def _warnings(found: dict[str, Any]) -> list[str]:

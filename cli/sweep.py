@@ -67,7 +67,19 @@ class _CommaOption(click.Option):
         return super().type_cast_value(ctx, list(dict.fromkeys(parts)))
 
 
-@click.command(short_help="Measure accuracy against time, over viewports and engines.")
+def _files(values: dict[str, Any]) -> options.Files:
+    picture = values["picture"] or values["output"].with_suffix(".png")
+    return options.Files(
+        reads=options.given(values["session"], values["scene"]),
+        writes=options.given(values["output"], picture),
+    )
+
+
+@click.command(
+    cls=options.Command,
+    files=_files,
+    short_help="Measure accuracy against time, over viewports and engines.",
+)
 @options.session_arg
 @options.scene_option
 @options.output_option("The sweep to write, SWEEP.h5.")
@@ -204,14 +216,14 @@ def sweep(
     written = read_sweep(output)
     write_picture_of(picture, written)
     if not written.frames.triangles_colliding.any():
-        click.echo(
+        options.tell(
             f"nothing collides in the frames {written.settings['frames']}: accuracy cannot be "
             "measured there, only time; choose others with --frames",
             err=True,
         )
     if as_json:
         names = {"sweep": str(output), "picture": str(picture)}
-        click.echo(json.dumps({**names, **sweep_as_dict(written)}))
+        options.tell(json.dumps({**names, **sweep_as_dict(written)}))
     else:
         _print_table(output, picture, written)
 
@@ -258,11 +270,11 @@ def _tell_simulation(
     write_simulation_picture(picture, swept)
     found = simulation_sweep_as_dict(swept)
     if as_json:
-        click.echo(json.dumps({"sweep": str(output), "picture": str(picture), **found}))
+        options.tell(json.dumps({"sweep": str(output), "picture": str(picture), **found}))
         return
     effects = ", ".join(swept.settings["effects"])
     frames = options.counted(swept.settings["n_frames"], "frame")
-    click.echo(f"{output}, {picture}: {frames}, {effects}, by {found['over']}")
+    options.tell(f"{output}, {picture}: {frames}, {effects}, by {found['over']}")
     lines = [
         (
             f"{found['over']}{', ms' if found['over'] == 'step' else ''}",
@@ -289,7 +301,7 @@ def _tell_simulation(
         )
     options.print_table(lines)
     chosen = "the step of `hybridve simulate`" if scale > 1 else "the paper's viewport"
-    click.echo(f"  *: {chosen}; + on the Pareto front of time and largest distance")
+    options.tell(f"  *: {chosen}; + on the Pareto front of time and largest distance")
 
 
 def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
@@ -297,7 +309,7 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
 
     found = sweep_as_dict(sweep)
     truth = found["truth"]
-    click.echo(f"{output}, {picture}: {len(found['frames'])} frames {sweep.settings['frames']}")
+    options.tell(f"{output}, {picture}: {len(found['frames'])} frames {sweep.settings['frames']}")
     finest = f"sampled every {mm(truth['spacing_m'], '.3g')} mm"
     if (truth["spacing_m"] or 0.0) > (truth["spacing_wanted_m"] or 0.0):
         finest += f" ({mm(truth['spacing_wanted_m'], '.3g')} were wanted, but are too many)"
@@ -307,7 +319,7 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
             f"{truth['triangles_open']} are left open "
             f"(no disc of {mm(truth['open_most_m'], '.3g')} mm)"
         )
-    click.echo(
+    options.tell(
         f"  truth: {truth['triangles_colliding']} of {truth['triangles_asked']} triangles asked "
         f"collide, {left_open}"
         + (f"; distances from {truth['points']} points, {finest}" if truth["points"] else "")
@@ -353,11 +365,11 @@ def _print_table(output: Path, picture: Path, sweep: "Sweep") -> None:
             )
     options.print_table(lines)
     for engine in found["engines"]:
-        click.echo(f"  {engine['name']}: {_cost_text(engine['name'], engine['cost'])}")
+        options.tell(f"  {engine['name']}: {_cost_text(engine['name'], engine['cost'])}")
     stages = ", ".join(
         f"{stage} {ms['median']:.2f} ({ms['iqr']:.2g})" for stage, ms in found["stage_ms"].items()
     )
-    click.echo(f"  once a frame, ms, median over the frames (IQR): {stages}")
+    options.tell(f"  once a frame, ms, median over the frames (IQR): {stages}")
 
 
 def _share(share: float | None) -> str:

@@ -1,6 +1,7 @@
 """``hybridve synth``: a generated recording whose truth is known."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -8,7 +9,16 @@ from hybridve.cli import options
 from hybridve.cli.progress import Terminal
 
 
-@click.command(short_help="Generate a recording with known truth.")
+def _files(values: dict[str, Any]) -> options.Files:
+    return options.Files(
+        reads=options.given(),
+        writes=options.given(values["output"]),
+    )
+
+
+@click.command(
+    cls=options.Command, files=_files, short_help="Generate a recording with known truth."
+)
 @click.argument("preset")
 @options.output_option("The folder to write the session into.")
 @click.option(
@@ -72,4 +82,4 @@ def synth(
         overwrite=overwrite,
         progress=Terminal(enabled=progress).stage,
     )
-    click.echo(f"{output / 'session.toml'}")
+    options.tell(f"{output / 'session.toml'}")

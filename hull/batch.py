@@ -1,6 +1,5 @@
 """Recordings against layouts, into reports: one, or every session with every scene."""
 
-import json
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from hybridve.hull.query.engine import EngineName
 from hybridve.hull.report.compare import Pair, report_name
 from hybridve.hull.report.machine import Run
 from hybridve.hull.report.read import read_report
+from hybridve.hull.report.result_file import refuse_other
 from hybridve.hull.report.schema import ReportHeader
 from hybridve.hull.report.summarize import summarize
 from hybridve.hull.report.write import ReportWriter, refuse_existing, refuse_result
@@ -75,7 +75,10 @@ def detect_one(
     )
     _say_not_simulated(loaded, watcher)
     chain = make_chain(opened, loaded, settings.evaluation, watcher.stage)
-    write_report(chain, output, settings, watcher)
+    if _is_finished(chain, output, settings):
+        watcher.say(f"{output}: stands already, finished with these settings")
+    else:
+        write_report(chain, output, settings, watcher)
 
 
 def _say_not_simulated(scene: Scene, watcher: Watcher) -> None:
@@ -226,14 +229,21 @@ def _made_or_finished(
 ) -> dict[str, Any]:
     """Return the summary of one report; one that is finished is not made again when resuming."""
     chain = make_chain(session, scene, settings.evaluation, watcher.stage)
-    if settings.resume and path.exists() and not settings.overwrite:
-        found = read_report(path)
-        wanted = json.loads(json.dumps([resolved_settings(chain), about_rig(chain)]))
-        if [found.settings, found.rig] != wanted:
-            raise ReportError(
-                f"{path}: was finished with other settings, another recording or another scene; "
-                "give the same again, or start anew with --overwrite"
-            )
-        return summarize(found)
-    write_report(chain, path, settings, watcher)
+    if not _is_finished(chain, path, settings):
+        write_report(chain, path, settings, watcher)
     return summarize(read_report(path))
+
+
+def _is_finished(chain: Chain, path: Path, settings: DetectSettings) -> bool:
+    """Tell whether a run that is taken up has its report already: it was cut off behind its end.
+
+    Raises
+    ------
+    ReportError
+        If the report is of something else, or damaged.
+    """
+    if not settings.resume or settings.overwrite or not path.exists():
+        return False
+    found = read_report(path)
+    refuse_other(path, [found.settings, found.rig], [resolved_settings(chain), about_rig(chain)])
+    return True

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridve.calib.errors import SessionError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
 from hybridve.calib.image_io import FrameSource, natural_order, read_raw
 from hybridve.hull.cad.readers import FORMATS, WITH_UNIT
 
@@ -131,8 +131,7 @@ def write_drafts(folder: Path) -> tuple[Survey, tuple[Path, Path]]:
     found = survey(folder)
     try:
         for path, text in ((session, session_text(found)), (scene, scene_text(found))):
-            with appearing(path) as partial:
-                partial.write_text(text, encoding="utf-8")
+            write_whole(path, text)
     except OSError as error:
         raise SessionError(f"{path}: cannot be written: {error.strerror}") from error
     return found, (session, scene)

@@ -9,12 +9,18 @@ another file. So what is kept lies in a folder named after all sources that are 
 they are, in ``compiled`` of the cache (see `hybridve.calib.cache`), or in ``NUMBA_CACHE_DIR`` where
 that is set. To load this module reads the sources, and makes nothing; the folder is opened for the
 first function that is called.
+
+numba's own files break what reads them where one is damaged, and where the disk is full. Here each
+function, for each types, is one file under a name made of both, with a checksum: one that is
+damaged is compiled anew, and where nothing can be written, nothing is kept.
 """
 
 import hashlib
 import logging
 import os
+import pickle
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -25,9 +31,11 @@ from typing import Any, TypeVar, cast
 import llvmlite.binding
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import CompileResultCacheImpl
+from numba.core.serialize import dumps
 
 from hybridve.calib.cache import cache_folder
+from hybridve.calib.files import appearing
 
 _logger = logging.getLogger(__name__)
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -97,17 +105,89 @@ def folder() -> Path | None:
     return opened
 
 
+class _Code(CompileResultCacheImpl):  # type: ignore[misc]  # numba has no types
+    """Turns compiled code into what can be kept, and back."""
+
+    def __init__(self) -> None:
+        """Look for no folder, as numba's own does."""
+
+
+_CODE = _Code()
+
+
 class _KeptCode:
-    """What is kept of one function's compiled code; no folder is touched before it is asked for."""
+    """What is kept of one function's compiled code; no folder is touched before it is asked for.
+
+    numba asks it as it would ask its own `numba.core.caching.FunctionCache`.
+    """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
-        self._code: Any = None
 
-    def __getattr__(self, name: str) -> Any:
-        if self._code is None:
-            self._code = NullCache() if folder() is None else FunctionCache(self._function)
-        return getattr(self._code, name)
+    @property
+    def cache_path(self) -> str | None:
+        """The folder."""
+        return None if folder() is None else str(folder())
+
+    def enable(self) -> None:
+        """Nothing turns it off."""
+
+    disable = flush = enable
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the code for arguments of some types, or None."""
+        target_context.refresh()
+        key = self._key(sig, target_context.codegen())
+        path = self._path(key)
+        if path is None:
+            return None
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            _logger.info("%s: compiled anew: %s", path, error.strerror)
+            return None
+        digest, data = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        if hashlib.sha256(data).digest() != digest:
+            _logger.info("%s: is damaged, compiled anew", path)
+            return None
+        try:
+            stored, payload = pickle.loads(data)
+            return _CODE.rebuild(target_context, payload) if stored == key else None
+        except Exception as error:  # of another library's version, and that has many names
+            _logger.info("%s: cannot be used, compiled anew: %s", path, error)
+            return None
+
+    def save_overload(self, sig: Any, code: Any) -> None:
+        """Keep the code for arguments of some types, where there is a folder and room."""
+        key = self._key(sig, code.codegen)
+        path = self._path(key)
+        if path is None:
+            return
+        data = dumps((key, _CODE.reduce(code)))
+        try:
+            with appearing(path, is_contended=True) as partial:
+                partial.write_bytes(hashlib.sha256(data).digest() + data)
+        except OSError as error:
+            _logger.warning("compiled code is not kept for the next start: %s", error)
+
+    def _key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        """Return what the code depends on besides the sources, which name the folder."""
+        name = f"{self._function.__module__}.{self._function.__qualname__}"
+        return name, str(sig), codegen.magic_tuple(), sys.implementation.cache_tag
+
+    def _path(self, key: tuple[Any, ...]) -> Path | None:
+        kept = folder()
+        if kept is None:
+            return None
+        module = self._function.__module__.rpartition(".")[2]
+        digits = hashlib.sha256(repr(key).encode()).hexdigest()[:_DIGITS]
+        return kept / f"{module}.{self._function.__name__}.{digits}.nbc"
+
+
+#: Bytes of the checksum that a file of compiled code begins with.
+_DIGEST_BYTES = 32
 
 
 #: A zero to begin counts with. For one written out, numba compiles what takes it a second time.

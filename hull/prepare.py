@@ -1,8 +1,7 @@
 """Compiles all that commands need, before it is needed: at set-up, or by ``doctor --prepare``.
 
 The code is run on the tiniest input, and what was compiled is kept where every later start looks
-(see `hybridve.hull.jit`). numba compiles in one thread at a time. Two processes side by side were
-tried: two that compile one function for different types at once would take each other's code.
+(see `hybridve.hull.jit`). numba compiles in one thread at a time.
 """
 
 import gc

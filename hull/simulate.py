@@ -56,6 +56,7 @@ from hybridve.hull.query.engine import Engine, EngineName
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.query.threads import Threads
 from hybridve.hull.report.machine import Run
+from hybridve.hull.report.result_file import refuse_other
 from hybridve.hull.report.simulation_data import (
     Group,
     Shown,
@@ -63,7 +64,7 @@ from hybridve.hull.report.simulation_data import (
     SimulationHeader,
     Variable,
 )
-from hybridve.hull.report.simulation_file import SimulationWriter
+from hybridve.hull.report.simulation_file import SimulationWriter, read_settings
 from hybridve.hull.report.write import refuse_result
 from hybridve.hull.trust import Witness, judge_cameras
 from hybridve.hull.watcher import Watcher
@@ -121,6 +122,10 @@ def simulate_one(
     with open_engine(settings.engine) as engine:
         simulation = Simulation.of(chain, engine, settings)
         header = simulation.header(settings, engine)
+        if settings.resume and output.exists() and not settings.overwrite:
+            refuse_other(output, read_settings(output), (header.settings, header.rig))
+            watcher.say(f"{output}: stands already, finished with these settings")
+            return
         with SimulationWriter(
             output, header, resume=settings.resume, overwrite=settings.overwrite
         ) as writer:

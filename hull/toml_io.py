@@ -5,12 +5,21 @@ import difflib
 import os
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 from pydantic import AfterValidator, BaseModel, ValidationError
 
+from hybridve.calib.bounded import (
+    DEEPEST,
+    has_control,
+    is_too_deep,
+    printable,
+    read_bounded,
+    texts_in,
+)
 from hybridve.calib.errors import HybridveError
 
 
@@ -33,6 +42,7 @@ _BEGUN_BY = {
     "session": "hybridve init",
     "scene": "hybridve init",
     "plan": "hybridve plan --example",
+    "batch": "hybridve batch --help",
 }
 
 
@@ -56,12 +66,20 @@ def read_toml(
         Of class `error_class`: there is no such file, or it is not TOML (with line and column).
     """
     try:
-        text = path.read_bytes()
+        text = read_bounded(path)
     except FileNotFoundError:
         begin = f", or begin one with `{_BEGUN_BY[kind]}`" if kind in _BEGUN_BY else ""
         raise error_class(f"{path}: there is no such {kind}; name a {kind}.toml{begin}") from None
     except OSError as error:
         raise error_class(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise error_class(f"{path}: {error}") from error
+    # A key in parts takes the parser the square of their number.
+    if any(line.partition(b"=")[0].count(b".") > DEEPEST for line in text.splitlines()):
+        raise error_class(
+            f"{path}: a key has more than {DEEPEST} parts, so deep are no tables; look at what "
+            "was written"
+        )
     try:
         table = tomllib.loads(_decoded(text))
     except UnicodeDecodeError as error:
@@ -73,6 +91,14 @@ def read_toml(
         if re.search(r"escape|hex value|'\\\\'", str(error)):
             hint = "; write folders with /, or the path in 'single quotes'"
         raise error_class(f"{path}: not valid TOML: {error}{hint}") from error
+    if is_too_deep(table):
+        raise error_class(f"{path}: holds tables nested too deeply; look at what was written")
+    for one in texts_in(table):
+        if has_control(one):
+            raise error_class(
+                f"{path}: holds a control character, in {printable(one)[:60]!r}; names and paths "
+                "have none"
+            )
     found = table.get("format")
     if isinstance(found, str) and found.startswith("hybridve-") and found != f"hybridve-{kind}":
         raise error_class(
@@ -183,3 +209,60 @@ def expand_root(root: str, path: Path, error_class: type[HybridveError]) -> Path
     if not folder.is_dir():
         raise error_class(f"{path}: root: there is no folder {folder}")
     return folder
+
+
+@dataclass(frozen=True, slots=True)
+class Roots:
+    """Where the files that a session or a scene names may lie: nowhere else is anything read.
+
+    Attributes
+    ----------
+    root : Path
+        Where its paths start.
+    allowed : tuple of Path
+        That, its own folder, and those that its key ``roots`` adds; all resolved.
+    """
+
+    root: Path
+    allowed: tuple[Path, ...]
+
+    @classmethod
+    def of(
+        cls, root: str, others: Sequence[str], path: Path, error_class: type[HybridveError]
+    ) -> "Roots":
+        """Return the folders that a file declares.
+
+        Raises
+        ------
+        HybridveError
+            Of class `error_class`: there is no such folder.
+        """
+        begin = expand_root(root, path, error_class)
+        more = (expand_root(one, path, error_class) for one in others)
+        return cls(begin, (begin, path.parent.resolve(), *more))
+
+    def refuse_outside(
+        self, name: str, files: Iterable[Path], error_class: type[HybridveError]
+    ) -> None:
+        """Refuse a name that leads out of the folders, by ``..``, as an absolute path or by links.
+
+        Raises
+        ------
+        HybridveError
+            Of class `error_class`: where it leads, and what would allow it.
+        """
+        folders: dict[Path, bool] = {}
+        for file in files:
+            if file.parent not in folders or file.is_symlink() or file.name == "..":
+                real = Path(os.path.realpath(file))
+                is_inside = any(real.is_relative_to(one) for one in self.allowed)
+                if not file.is_symlink():
+                    folders[file.parent] = is_inside
+            else:
+                is_inside = folders[file.parent]
+            if not is_inside:
+                real = Path(os.path.realpath(file))
+                raise error_class(
+                    f"{name!r} leads out of {self.root}, to {real}; what lies elsewhere is read "
+                    f'only where the file says so: roots = ["{real.parent}"]'
+                )

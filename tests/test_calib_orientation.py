@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from hybridve.calib.orientation import exif_orientation, picture_size, said_orientation
+from hybridve.calib.opencv_files import picture_size
+from hybridve.calib.orientation import exif_orientation, said_orientation
 
 ORIENTATION = 0x0112
 

@@ -413,7 +413,8 @@ def test_the_same_seed_gives_the_same_bytes_and_overwriting_leaves_nothing_old(
     again = tmp_path / "again"
     again.mkdir()
     shutil.copy(folder / "truth.h5", again)  # a generated recording stands there already
-    (again / "old.txt").write_text("old")
+    (again / "meshes").mkdir()
+    (again / "meshes" / "old.txt").write_text("old")
 
     write_session("boxes", again, seed=3, n_frames=N_FRAMES, overwrite=True)
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -122,8 +122,8 @@ def test_other_endings_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_chart_cut_off_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(self: Figure, path: Path, **_: object) -> None:
-        Path(path).write_bytes(b"half")
+    def interrupt(self: Figure, file: BinaryIO, **_: object) -> None:
+        file.write(b"half")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Figure, "savefig", interrupt)

@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hybridve.calib.bounded import DEEPEST
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats import opencv_lens
@@ -115,7 +116,7 @@ def read_camera_toml(path: Path) -> ForeignRig:
         If it is not TOML, has no section of a camera, or one is damaged.
     """
     try:
-        content = tomllib.loads(read_text(path))
+        content = tomllib.loads(_short_keys(read_text(path), path))
     except tomllib.TOMLDecodeError as error:
         raise CalibrationError(f"{path}: not TOML ({error})") from error
     nested = content.get("cameras")
@@ -167,3 +168,10 @@ def read_camera_toml(path: Path) -> ForeignRig:
         unit="m" if is_caliscope else said if isinstance(said, str) else None,
         incomplete=incomplete,
     )
+
+
+def _short_keys(text: str, path: Path) -> str:
+    """Return the text; a key in very many parts takes the parser the square of their number."""
+    if any(line.partition("=")[0].count(".") > DEEPEST for line in text.splitlines()):
+        raise CalibrationError(f"{path}: a key has more than {DEEPEST} parts, so deep is no rig")
+    return text

@@ -3,10 +3,10 @@
 import tempfile
 from pathlib import Path
 
-import pycolmap
-
 from hybridve.calib.camera import Camera
+from hybridve.calib.colmap_library import pycolmap
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.files import write_together
 from hybridve.calib.lens import as_colmap
 from hybridve.calib.pose import Pose, compose, invert
 from hybridve.calib.provenance import MadeElsewhere
@@ -45,7 +45,7 @@ def write_colmap_model(folder: Path, rig: Rig) -> None:
 
     The rig's first camera is COLMAP's reference sensor, so that the frame's pose is its pose.
     Images are named after the cameras, with ``_`` for a space, at which COLMAP would cut the name
-    off. The files are replaced one by one, each when complete.
+    off. No file is replaced before all are complete.
 
     Raises
     ------
@@ -78,13 +78,28 @@ def write_colmap_model(folder: Path, rig: Rig) -> None:
         model.add_image(pycolmap.Image(name=name, camera_id=number, image_id=number, frame_id=1))
     model.register_frame(1)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".partial-") as partial:
+        with tempfile.TemporaryDirectory(prefix="hybridve-") as partial:
             model.write_text(partial)
-            for path in sorted(Path(partial).iterdir()):
-                path.replace(folder / path.name)
+            contents = {path.name: path.read_bytes() for path in Path(partial).iterdir()}
+            # COLMAP does not notice that a disk is full.
+            if not _is_whole(Path(partial), len(rig.cameras)):
+                raise CalibrationError(
+                    f"{folder}: cannot be written: the folder for temporary files, "
+                    f"{tempfile.gettempdir()}, has no room for the model"
+                )
+        folder.mkdir(parents=True, exist_ok=True)
+        write_together({folder / name: content for name, content in sorted(contents.items())})
     except OSError as error:
         raise CalibrationError(f"{folder}: cannot be written ({error.strerror})") from error
+
+
+def _is_whole(folder: Path, count: int) -> bool:
+    """Tell whether a model that was written has as many cameras and images as it should."""
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+    except (ValueError, RuntimeError):
+        return False
+    return model.num_cameras() == count and len(model.reg_image_ids()) == count
 
 
 def read_colmap_model(folder: Path) -> Rig:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.bounded import read_bounded
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.pose import Pose, nearest_rotation, rotation_of
@@ -97,11 +98,13 @@ def read_text(path: Path) -> str:
         If it is not UTF-8.
     """
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_bounded(path).decode("utf-8-sig")
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise UnknownRigError(f"{path}: cannot be read as text ({error.reason})") from error
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {error}") from error
 
 
 def as_numbers(value: Any, what: str, where: str) -> NDArray[np.float64]:

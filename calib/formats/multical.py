@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hybridve.calib.bounded import parse_json
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats import opencv_lens
@@ -83,7 +84,7 @@ def read_multical(path: Path) -> ForeignRig:
         If it is not multical's, or a camera or pose is damaged.
     """
     try:
-        content = json.loads(read_text(path))
+        content = parse_json(read_text(path))
     except ValueError as error:
         raise CalibrationError(f"{path}: not JSON ({error})") from error
     if not is_multical(content):

@@ -15,7 +15,6 @@ process_data/colmap_utils.py and data/dataparsers/nerfstudio_dataparser.py; Inst
 docs/nerf_dataset_tips.md and scripts/colmap2nerf.py.
 """
 
-import json
 import math
 from collections import Counter
 from pathlib import Path, PurePosixPath
@@ -24,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.bounded import parse_json
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.formats.foreign import (
     ForeignCamera,
@@ -61,7 +61,7 @@ def read_transforms(path: Path) -> ForeignRig:
         If a frame is damaged, or its lens is not one that COLMAP has.
     """
     try:
-        content = json.loads(read_text(path))
+        content = parse_json(read_text(path))
     except ValueError as error:
         raise CalibrationError(f"{path}: not JSON ({error})") from error
     if not is_transforms(content):

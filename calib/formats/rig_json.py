@@ -2,15 +2,15 @@
 
 import json
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hybridve.calib.bounded import parse_json, read_bounded
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_together
 from hybridve.calib.provenance import provenance_from_plain, provenance_to_plain
 from hybridve.calib.rig import Mount, Rig, RigCovariance
 from hybridve.calib.verdict import RigTest
@@ -100,7 +100,7 @@ def read_rig(path: Path) -> Rig:
         If the file is missing, is not a rig, or is of a version that this program does not know.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(read_bounded(path))
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
@@ -180,9 +180,7 @@ def _covariance_from_dict(entry: Mapping[str, Any]) -> RigCovariance:
 def write_texts(texts: Mapping[Path, str]) -> None:
     """Write text files, none under its final name before all are complete."""
     try:
-        with ExitStack() as files:
-            for path, text in texts.items():
-                files.enter_context(appearing(path)).write_text(text, encoding="utf-8")
+        write_together({path: text.encode() for path, text in texts.items()})
     except OSError as error:
         named = error.filename or next(iter(texts))
         raise CalibrationError(

@@ -4,7 +4,6 @@ A foreign file is recognised by what it holds, not by its name. What it does not
 where its pixel centres lie, the images' size) is given by the caller, never guessed.
 """
 
-import json
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridve.calib.bounded import parse_json
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
 from hybridve.calib.files import nearly
@@ -389,7 +389,7 @@ def _read_file(path: Path, names: list[str]) -> ForeignRig | Rig:
         if f'"{FORMAT}"' in start[:2000]:
             return read_rig(path)
         try:
-            content = json.loads(text)
+            content = parse_json(text)
         except ValueError as error:
             raise CalibrationError(f"{path}: not JSON ({error})") from error
         if multical.is_multical(content):

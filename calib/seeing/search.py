@@ -40,7 +40,7 @@ class Search:
         self.settings = settings
         self.report = report
         self.cache = CornerCache(None) if kept is None else kept
-        self.threads = settings.threads or os.cpu_count() or 1
+        self.threads = settings.threads or _usable_cpus()
         self.pool = ThreadPoolExecutor(self.threads)
         self._descriptions = [describe_board(board) for board in boards]
 
@@ -291,3 +291,10 @@ def length_of(search: Search, source: FrameSource) -> int:
     question = ("length", search.identify(source.paths, source.label))
     length: int = search.cache.recall(question, count)[0]["length"]
     return length
+
+
+def _usable_cpus() -> int:
+    """Return how many processors this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -15,9 +15,9 @@ Agarwal, Mierle and others, *Ceres Solver*.
 from dataclasses import replace
 
 import numpy as np
-import pycolmap
 
 from hybridve.calib.boards.board import is_seen
+from hybridve.calib.colmap_library import pycolmap
 from hybridve.calib.lens import as_colmap
 from hybridve.calib.pose import Pose, compose, invert, transform
 from hybridve.calib.solving.bundle import Bundle, BundleView, total_cost

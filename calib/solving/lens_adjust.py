@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
+from hybridve.calib.colmap_library import pycolmap
 from hybridve.calib.lens import img_from_cam
 from hybridve.calib.pose import turned_pose
 from hybridve.calib.solving.bundle import POSE, lens_derivatives

@@ -15,7 +15,6 @@ glTF 2.0 Specification, Khronos Group, sections 3.5 (scenes), 3.6 (buffers and a
 
 import base64
 import binascii
-import json
 import math
 import struct
 import urllib.parse
@@ -25,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.bounded import parse_json
 from hybridve.hull.cad.part import (
     Contents,
     Part,
@@ -127,7 +127,7 @@ def _split(content: bytes) -> tuple[dict[str, Any], bytes]:
     else:
         text = content
     try:
-        document = json.loads(text)
+        document = parse_json(text)
     except ValueError as error:
         raise ValueError(f"its JSON cannot be read: {error}") from None
     asset = document.get("asset") if isinstance(document, dict) else None

@@ -117,6 +117,12 @@ def read_cad(path: Path, *, merge: bool = False, tessellation_m: float = TESSELL
         names = leans_on(content, kind)
     except ValueError as error:
         raise SceneError(f"{path}: the file cannot be read: {error}") from error
+    for name in names:
+        if not _is_beside(path, name):
+            raise SceneError(
+                f"{path}: names the file {name[:100]!r}, which lies outside of its folder; put it "
+                "beside it"
+            )
     beside = {
         name: _read_bytes(path.parent / name) for name in names if _is_file(path.parent / name)
     }
@@ -159,6 +165,15 @@ def read_cad(path: Path, *, merge: bool = False, tessellation_m: float = TESSELL
         tessellation_m=tessellation_m if kind in TESSELLATED else None,
         notes=notes,
     )
+
+
+def _is_beside(path: Path, name: str) -> bool:
+    """Tell whether a file that a mesh names lies in its folder or below it, links followed."""
+    try:
+        folder = path.parent.resolve()
+        return (path.parent / name).resolve().is_relative_to(folder)
+    except (OSError, ValueError, RuntimeError):
+        return False
 
 
 def _is_file(path: Path) -> bool:
@@ -297,13 +312,18 @@ def _log_flaws(path: Path, part: Part, topology: Topology) -> None:
         _log.info("%s: closed, but inside out", label)
 
 
+#: Coordinates at most, in whatever unit: what is reckoned with their fourth power stays finite.
+_FARTHEST = 1e18
+
+
 def check_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int32], label: str) -> None:
     """Look at a mesh's numbers.
 
     Raises
     ------
     SceneError
-        If a coordinate is not finite or a face names a vertex that is not there.
+        If a coordinate is not finite, or beyond all measure, or a face names a vertex that is not
+        there.
     """
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
@@ -312,6 +332,12 @@ def check_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int32], label: s
             f"{label}: vertex {worst} is {vertices[worst].tolist()}: "
             f"{int((~finite).sum())} of {len(vertices)} vertices are not finite numbers; "
             "export it again"
+        )
+    most = float(np.abs(vertices).max())
+    if most > _FARTHEST:
+        raise SceneError(
+            f"{label}: a coordinate is {most:.3g}, too large for anything that is built; export it "
+            "again"
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SceneError(f"{label}: a face names a vertex that is not there; export it again")

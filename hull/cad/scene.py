@@ -46,7 +46,7 @@ from hybridve.hull.cad.part import Part, Up
 from hybridve.hull.cad.readers import FORMATS, TESSELLATED, WITH_UNIT
 from hybridve.hull.cad.rules import Rule
 from hybridve.hull.cad.topology import Topology, meeting_faces
-from hybridve.hull.toml_io import Name, expand_root, explain_validation, like, read_toml
+from hybridve.hull.toml_io import Name, Roots, explain_validation, like, read_toml
 
 _log = logging.getLogger(__name__)
 
@@ -201,6 +201,7 @@ class _SceneTable(_Table):
     format: Literal["hybridve-scene"]
     version: Literal[1]
     root: str = "."
+    roots: list[str] = []
     object: Annotated[list[ObjectTable], Field(min_length=1)]
     effect: list[_EffectTable] = []
     rule: list[_RuleTable] = []
@@ -380,12 +381,14 @@ def load_scene(path: Path) -> Scene:
                 f"{path}: object.{number}.name: {entry.name!r} is the name of object."
                 f"{before.index(entry.name) + 1} too; give each object its own"
             )
-    root = expand_root(parsed.root, path, SceneError)
+    roots = Roots.of(parsed.root, parsed.roots, path, SceneError)
+    root = roots.root
     checksum = hashlib.sha256(text)
     objects: dict[str, SceneObject] = {}
     for number, entry in enumerate(parsed.object, start=1):
         label = f"{path}: object.{number}"
         try:
+            roots.refuse_outside(entry.mesh, [root / entry.mesh], SceneError)
             kind = kind_of(root / entry.mesh)
             _refuse_what_the_kind_has(entry, kind, label)
             tessellation_m = TESSELLATION_M
@@ -404,7 +407,7 @@ def load_scene(path: Path) -> Scene:
                 f"and it is never guessed: one of {', '.join(UNITS_M)}"
             )
         _tell_coarse(entry, cad, label)
-        motion = _motion(entry, root, label)
+        motion = _motion(entry, roots, label)
         for part in _place(entry, cad, motion):
             if part.name in objects:
                 raise SceneError(
@@ -498,13 +501,15 @@ def _motion_file(entry: ObjectTable) -> tuple[str, str] | None:
     return None
 
 
-def _motion(entry: ObjectTable, root: Path, label: str) -> Motion | None:
+def _motion(entry: ObjectTable, roots: Roots, label: str) -> Motion | None:
     """Return how an object moves; None if it does not."""
     told_by = _motion_file(entry)
     if told_by is None:
         return None
     key, name = told_by
+    root = roots.root
     try:
+        roots.refuse_outside(name, [root / name], CalibrationError)
         if entry.hinge is not None:
             rotation, translation_m = _placement(entry)
             return Motion.of_hinge(

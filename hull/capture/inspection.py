@@ -20,7 +20,8 @@ import numpy as np
 from hybridve.calib.avi_index import avi_frames
 from hybridve.calib.errors import Faults, SessionError
 from hybridve.calib.image_io import FrameSource
-from hybridve.calib.orientation import picture_size, said_orientation
+from hybridve.calib.opencv_files import picture_size
+from hybridve.calib.orientation import said_orientation
 from hybridve.calib.plain import Told
 from hybridve.hull.capture.recording import HEADER_SLACK, mask_reading
 from hybridve.hull.capture.session import Session, SessionCamera, load_session

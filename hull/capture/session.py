@@ -32,7 +32,7 @@ from hybridve.hull.capture.session_tables import (
     TargetTable,
     WorldPoint,
 )
-from hybridve.hull.toml_io import expand_root, explain_validation, like, read_toml
+from hybridve.hull.toml_io import Roots, explain_validation, like, read_toml
 
 _log = logging.getLogger(__name__)
 
@@ -238,14 +238,15 @@ def load_session(path: Path) -> Session:
         raise SessionError(f"{path}: rig_unit: 'squares' needs a [target] with square_mm")
     shared_params = _check_lenses(parsed.camera, path)
     _check_points(parsed, names, path)
-    root = expand_root(parsed.root, path, SessionError)
+    roots = Roots.of(parsed.root, parsed.roots, path, SessionError)
+    _refuse_rig_outside(parsed, roots, path)
     if parsed.min_cameras > len(names):
         raise SessionError(
             f"{path}: min_cameras: {parsed.min_cameras} of {len(names)} cameras cannot see a point"
         )
     faults = Faults()
     found = [
-        _find_files(camera, number, shared_params, root, path, faults)
+        _find_files(camera, number, shared_params, roots, path, faults)
         for number, camera in enumerate(parsed.camera, start=1)
     ]
     faults.refuse()
@@ -265,7 +266,7 @@ def load_session(path: Path) -> Session:
         rig_file = RigFile(parsed.rig, parsed.rig_unit, parsed.rig_pixel_centre)
     return Session(
         path=path,
-        root=root,
+        root=roots.root,
         fps=fps,
         unseen=parsed.unseen,
         min_cameras=parsed.min_cameras,
@@ -281,6 +282,21 @@ def load_session(path: Path) -> Session:
         cameras=cameras,
         checksum=hashlib.sha256(text).hexdigest(),
     )
+
+
+def _refuse_rig_outside(parsed: SessionTable, roots: Roots, path: Path) -> None:
+    """Refuse a rig that lies where the session says of no file that it may."""
+    if parsed.rig is None:
+        return
+    files = [
+        roots.root / parsed.rig.replace("{camera}", name)
+        for name in [camera.name for camera in parsed.camera]
+    ]
+    files += [one for file in files if file.is_dir() for one in file.iterdir()]
+    try:
+        roots.refuse_outside(parsed.rig, files, SessionError)
+    except SessionError as error:
+        raise SessionError(f"{path}: rig: {error}") from error
 
 
 def load_targets(path: Path) -> tuple[TargetTable, ...]:
@@ -519,20 +535,28 @@ def _find_files(
     table: CameraTable,
     number: int,
     shared_params: dict[str, tuple[float, ...]],
-    root: Path,
+    roots: Roots,
     path: Path,
     faults: Faults,
 ) -> SessionCamera:
     """Return a camera with its files; those that are missing are None, and told to `faults`."""
+    root = roots.root
 
     def opened(key: str, name: str) -> FrameSource:
         try:
-            return open_source(root, name)
+            roots.refuse_outside(name, [root / name], SessionError)
+            source = open_source(root, name)
+            roots.refuse_outside(name, source.paths, SessionError)
+            return source
         except SessionError as error:
             raise SessionError(f"{path}: camera.{number}.{key}: {error}") from error
 
     def file_of(key: str, name: str) -> Path:
         file: Path = root / name
+        try:
+            roots.refuse_outside(name, [file], SessionError)
+        except SessionError as error:
+            raise SessionError(f"{path}: camera.{number}.{key}: {error}") from error
         if not file.is_file():
             raise SessionError(
                 f"{path}: camera.{number}.{key}: there is no file {name!r} in {root}{nearly(file)}"

@@ -253,6 +253,7 @@ class SessionTable(_Table):
     format: Literal["hybridve-session"]
     version: Literal[1]
     root: str = "."
+    roots: list[str] = []
     fps: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     world: Literal["board", "points", "floor"] = "board"
     sync: Literal["given", "estimate"] = "given"

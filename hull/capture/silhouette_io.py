@@ -17,15 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import sink
+from hybridve.hull.stored import DAMAGED, DamagedError, damage_in, open_stored, remember
 
 FORMAT = "hybridve-silhouettes"
 VERSION = 1
 
 _STORED = {"compression": "gzip", "shuffle": True, "fletcher32": True, "track_times": False}
-
-#: What HDF5 raises on files that are damaged, and Python on what it then reads from them.
-_DAMAGED = (OSError, KeyError, ValueError, RuntimeError, TypeError, AttributeError)
 
 
 class SilhouetteWriter:
@@ -56,14 +54,21 @@ class SilhouetteWriter:
         stamp: str,
     ) -> None:
         self._path = path
-        self._files = ExitStack()
         self._sizes_px = sizes_px
         self._reasons: list[str] = []
+        self._masks: list[h5py.Dataset] = []
         try:
-            self._file = h5py.File(self._files.enter_context(appearing(path)), "w")
+            with ExitStack() as files:
+                self._sink = files.enter_context(sink(path, holds_errors=True))
+                self._file = h5py.File(self._sink, "w")
+                files.push(self._finish)
+                self._begin(names, stamp)
+                self._files = files.pop_all()
         except OSError as error:
             raise self._unwritable(error) from error
-        self._files.push(self._finish)
+
+    def _begin(self, names: Sequence[str], stamp: str) -> None:
+        """Write what stands before the first frame."""
         self._file.attrs["format"] = FORMAT
         self._file.attrs["version"] = VERSION
         for key, text, description in (
@@ -71,8 +76,7 @@ class SilhouetteWriter:
             ("stamp", stamp, "what the silhouettes were made from, as JSON"),
         ):
             _describe(self._file.create_dataset(key, data=text, track_times=False), description)
-        self._masks = []
-        for number, (width, height) in enumerate(sizes_px):
+        for number, (width, height) in enumerate(self._sizes_px):
             row_bytes = -(-width // 8)
             dataset = self._file.create_dataset(
                 f"masks/{number}",
@@ -98,13 +102,12 @@ class SilhouetteWriter:
             ):
                 if mask.shape != (height, width):
                     raise ValueError(f"mask {number} is {mask.shape}, not {(height, width)}")
-        try:
-            for number, dataset in enumerate(self._masks):
-                dataset.resize(len(self._reasons) + 1, axis=0)
-                if masks is not None:
-                    dataset[-1] = np.packbits(masks[number], axis=1)
-        except OSError as error:  # the disk is full
-            raise self._unwritable(error) from error
+        for number, dataset in enumerate(self._masks):
+            dataset.resize(len(self._reasons) + 1, axis=0)
+            if masks is not None:
+                dataset[-1] = np.packbits(masks[number], axis=1)
+        if self._sink.error is not None:  # the disk is full
+            raise self._unwritable(self._sink.error) from self._sink.error
         self._reasons.append("" if masks is not None else reason or "a camera lacks this frame")
 
     def __enter__(self) -> Self:
@@ -121,6 +124,8 @@ class SilhouetteWriter:
             self._files.__exit__(kind, error, trace)
         except OSError as failure:
             raise self._unwritable(failure) from failure
+        if kind is None:
+            remember(self._path)
 
     def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
@@ -170,8 +175,8 @@ class SilhouetteReader:
         if not path.is_file():
             raise ReportError(f"{path}: there are no silhouettes; run `hybridve segment` first")
         try:
-            self._file = h5py.File(path, "r")
-        except OSError as error:
+            self._file = open_stored(path)
+        except (DamagedError, *DAMAGED) as error:
             raise self._damaged(error) from error
         try:
             found = self._file.attrs.get("format", "an unknown format")
@@ -192,7 +197,7 @@ class SilhouetteReader:
                 n_frames, _, row_bytes = dataset.shape
                 if (n_frames, row_bytes) != (len(self._reasons), -(-width // 8)):
                     raise ValueError("sizes contradict each other")
-        except _DAMAGED as error:
+        except DAMAGED as error:
             self._file.close()
             raise self._damaged(error) from error
         except ReportError:
@@ -212,13 +217,13 @@ class SilhouetteReader:
                 np.unpackbits(dataset[index], axis=1, count=width)
                 for dataset, width in zip(self._masks, self._widths_px, strict=True)
             ]
-        except _DAMAGED as error:
+        except DAMAGED as error:
             raise self._damaged(error) from error
         return masks, ""
 
     def _damaged(self, error: Exception) -> ReportError:
         return ReportError(
-            f"{self._path}: not readable silhouettes, or damaged ({_first_line(error)}); "
+            f"{self._path}: not readable silhouettes, or damaged ({damage_in(error)}); "
             "run `hybridve segment --overwrite`"
         )
 

@@ -19,6 +19,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from hybridve.calib.errors import ReportError
 from hybridve.calib.files import appearing
+from hybridve.hull.places import MARK
 
 Vector = tuple[float, float, float]
 
@@ -120,6 +121,7 @@ def write_bcf(path: Path, project: str, topics: Sequence[BcfTopic]) -> None:
             appearing(path) as partial,
             zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as file,
         ):
+            file.comment = MARK.encode()
             _add(file, "bcf.version", _xml(Element("Version", VersionId="3.0")))
             _add(file, "project.bcfp", _xml(_project(project)))
             _add(file, "extensions.xml", _xml(_extensions(topics)))

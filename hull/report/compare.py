@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
 
 #: Between a session and a layout in the name of their report; names themselves never hold it.
 _BETWEEN = "__"
@@ -189,8 +189,7 @@ def write_comparison(path: Path, comparison: dict[str, Any]) -> None:
             about = [row["layout"], row["object"], quantity.key, quantity.unit, quantity.kind]
             writer.writerow([*about, *cells])
     try:
-        with appearing(path) as partial:
-            partial.write_text(text.getvalue(), encoding="utf-8")
+        write_whole(path, text.getvalue())
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -26,7 +26,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
 from hybridve.calib.plain import to_json
 from hybridve.hull.contact.gathering import Boxes, matched
 from hybridve.hull.report.clashes import Clash
@@ -226,8 +226,7 @@ def write_ledger(ledger: Ledger) -> None:
     """
     path = ledger.path
     try:
-        with appearing(path) as partial:
-            partial.write_text(_text(ledger), encoding="utf-8")
+        write_whole(path, _text(ledger))
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -14,8 +14,8 @@ goes on from its last frame; they become the file once the last frame is done.
 """
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import sink
 from hybridve.calib.plain import read_strictly, to_plain
 from hybridve.calib.pose import placed
 from hybridve.hull.agreement.outlines import FrameOutlines, pack_frames, unpack_frames
@@ -38,8 +38,11 @@ from hybridve.hull.report.result_file import (
     begin_parts,
     parts_of,
     read_run,
+    read_stamp,
     reading,
     refuse_parts,
+    remove_parts,
+    sound_parts,
     store,
     store_text,
     write_run,
@@ -144,8 +147,8 @@ class SimulationWriter:
             begin_parts(path, self._parts, json.dumps(stamp))
 
     def _take_up(self, stamp: Mapping[str, Any]) -> None:
-        path = self._parts / "settings.json"
-        found = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        told = read_stamp(self._parts)
+        found = json.loads(told) if told else {}
         for name, version in stamp["solvers"].items():
             before = found.get("solvers", {}).get(name)
             if before is not None and before != version:
@@ -159,6 +162,7 @@ class SimulationWriter:
                 f"{self._parts}: the run that was cut off had other settings; give the same again, "
                 "or start anew with --overwrite"
             )
+        sound_parts(self._parts, "frame/index")
         self.n_done = sum(len(part["frame/index"]) for part in self._loaded(_is_index))
 
     def append(
@@ -207,7 +211,7 @@ class SimulationWriter:
             poses = np.stack([frame.poses.get(name, nowhere) for frame in frames])
             columns[f"moving/{name}"] = _PLACE.about(poses, origin_m)
         part = self._parts / f"{self.n_done:09d}.npz"
-        with appearing(part) as partial, partial.open("wb") as file:
+        with sink(part) as file:
             np.savez(file, **columns)  # type: ignore[arg-type]  # the stub takes names for options
         self.n_done += len(frames)
         self._pending, self._pending_bytes = [], 0
@@ -251,7 +255,7 @@ class SimulationWriter:
         """Make the parts the file, with what the cameras say about each other."""
         with writing(self._path) as file:
             self._write(file, agreement)
-        shutil.rmtree(self._parts)
+        remove_parts(self._parts)
 
     def _write(self, file: h5py.File, agreement: SessionAgreement) -> None:
         header = self._header
@@ -361,7 +365,8 @@ class SimulationWriter:
     ) -> None:
         """Leave finished parts where they are: the next run takes them up."""
         if self._parts.is_dir() and not any(self._parts.glob("*.npz")):
-            shutil.rmtree(self._parts)
+            with suppress(OSError):  # what went wrong may be that nothing can be written
+                remove_parts(self._parts)
 
 
 _ORIGIN = Described(
@@ -424,6 +429,21 @@ def _shown_points(places_m: NDArray[np.floating]) -> FramePoints:
     step = max(1, -(-len(there) // _MOST_SHOWN))
     shown = there[::step].astype(np.float32)
     return FramePoints(np.array([len(shown)]), shown, np.zeros(len(shown), np.uint32))
+
+
+def read_settings(path: Path) -> tuple[Any, Any]:
+    """Return what a simulation was made with: its settings and its rig, as JSON has them.
+
+    Raises
+    ------
+    ReportError
+        As of `read_simulation`.
+    """
+    with reading(path, "simulation", VERSION) as file:
+        stored = file["hybridve/settings"]
+        return json.loads(stored["configuration"].asstr()[()]), json.loads(
+            stored["rig"].asstr()[()]
+        )
 
 
 def read_simulation(path: Path) -> StoredSimulation:

@@ -9,9 +9,9 @@ what stands, and the result is the same as that of a run that was never cut off.
 import json
 import operator
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import sink
 from hybridve.calib.plain import to_plain
 from hybridve.hull.agreement.outlines import FrameOutlines, Outline
 from hybridve.hull.agreement.record import SessionAgreement
@@ -48,7 +48,10 @@ from hybridve.hull.report.result_file import (
     STORED,
     begin_parts,
     parts_of,
+    read_stamp,
     refuse_parts,
+    remove_parts,
+    sound_parts,
     store,
     store_text,
     write_run,
@@ -106,7 +109,8 @@ class ReportWriter:
         self._n_pending_runs = self._n_pending_vertices = 0
         self.n_done = 0
         self._write_s = 0.0
-        refuse_result(path, resume=resume, overwrite=overwrite)
+        refuse_existing(path, overwrite=overwrite)
+        refuse_parts(self._parts, resume=resume, overwrite=overwrite)
         stamp = json.dumps(
             {"settings": header.settings, "rig": header.rig, "engine": header.engine},
             sort_keys=True,
@@ -117,13 +121,12 @@ class ReportWriter:
             begin_parts(path, self._parts, stamp)
 
     def _take_up(self, stamp: str) -> None:
-        settings = self._parts / "settings.json"
-        if not settings.is_file() or settings.read_text(encoding="utf-8") != stamp:
+        if read_stamp(self._parts) != stamp:
             raise ReportError(
                 f"{self._parts}: the run that was cut off had other settings; give the same again, "
                 "or start anew with --overwrite"
             )
-        for part in self._part_paths():
+        for part in sound_parts(self._parts, _frame_key("index")):
             with np.load(part) as columns:
                 self.n_done += len(columns[_frame_key("index")])
 
@@ -150,7 +153,7 @@ class ReportWriter:
         started = time.perf_counter()
         columns = _columns(self._pending, self._header)
         part = self._parts / f"{self.n_done:09d}.npz"
-        with appearing(part) as partial, partial.open("wb") as file:
+        with sink(part) as file:
             np.savez(file, **columns)  # type: ignore[arg-type]  # the stub takes the names for options
         self.n_done += len(self._pending)
         self._pending, self._n_pending_runs, self._n_pending_vertices = [], 0, 0
@@ -206,7 +209,7 @@ class ReportWriter:
         self._flush()
         with writing(self._path) as file:
             self._write(file, agreement or SessionAgreement())
-        shutil.rmtree(self._parts)
+        remove_parts(self._parts)
 
     def _write(self, file: h5py.File, agreement: SessionAgreement) -> None:
         header = self._header
@@ -418,10 +421,13 @@ class ReportWriter:
         trace: TracebackType | None,
     ) -> None:
         """Keep what is done if the run was cut off; it can be taken up again."""
-        if kind is not None:
+        if kind is None:
+            return
+        with suppress(OSError):  # what went wrong may be that nothing can be written
             self._flush()
-            if self.n_done == 0:
-                shutil.rmtree(self._parts, ignore_errors=True)
+        if self.n_done == 0:
+            with suppress(OSError):
+                remove_parts(self._parts)
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
@@ -465,13 +471,15 @@ def refuse_existing_in(folder: Path, name: str, *, overwrite: bool) -> None:
 def refuse_result(path: Path, *, resume: bool, overwrite: bool) -> None:
     """Refuse to begin a result that is gathered in parts beside it, where that may not be.
 
+    One that stands there already may be taken up: it is finished.
+
     Raises
     ------
     ReportError
         As of `refuse_existing`; or if the parts of a run that was cut off stand there, and are to
         be neither taken up nor replaced.
     """
-    refuse_existing(path, overwrite=overwrite)
+    refuse_existing(path, overwrite=overwrite or resume)
     refuse_parts(parts_of(path), resume=resume, overwrite=overwrite)
 
 

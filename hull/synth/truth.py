@@ -28,13 +28,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
-from hybridve.calib.errors import SessionError
+from hybridve.calib.errors import ReportError, SessionError
 from hybridve.calib.pose import Pose
+from hybridve.hull.stored import DAMAGED, open_stored
 from hybridve.hull.synth.shapes import SHAPES, Shape
 
 FORMAT = "hybridve-truth"
@@ -292,8 +292,10 @@ def _open(folder: Path) -> Any:
     if not path.is_file():
         raise SessionError(f"{path}: there is no such file; {folder} was not generated")
     try:
-        file = h5py.File(path, "r")
-    except OSError as error:
+        file = open_stored(path)
+    except ReportError as error:
+        raise SessionError(str(error)) from error
+    except DAMAGED as error:
         raise SessionError(f"{path}: not an HDF5 file that can be read: {error}") from error
     kind, version = file.attrs.get("format"), file.attrs.get("version")
     if kind != FORMAT or version != VERSION:

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.files import Sink
 from hybridve.calib.pose import Pose, invert, transform
 from hybridve.hull.synth.closest import TOLERANCE_M, Closest, closest_on_surface
 from hybridve.hull.synth.cones import RESOLUTION_M, HullDistance, Surface, TrueHull
@@ -75,7 +76,8 @@ class TruthWriter:
         self._length_s = (n_frames - 1) / fps
         self._poses: list[list[Pose]] = []
         self._found: list[list[PartInFrame]] = []
-        self._file = h5py.File(path, "w", track_order=True)
+        self._sink = Sink(path, holds_errors=True)
+        self._file = h5py.File(self._sink, "w", track_order=True)
         self._file.attrs.update(
             format=FORMAT,
             version=VERSION,
@@ -238,6 +240,9 @@ class TruthWriter:
         if kind is None:
             self._finish()
         self._file.close()
+        self._sink.close()
+        if kind is None and self._sink.error is not None:
+            raise self._sink.error
 
 
 #: How every dataset is stored.

@@ -1,5 +1,7 @@
 """A preset becomes a folder: session.toml, scene.toml, images, videos, meshes and truth.h5."""
 
+import errno
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridve.calib.avi_index import avi_frames
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import SessionError
@@ -172,8 +175,15 @@ def _appearing(folder: Path, overwrite: bool) -> Iterator[Path]:
         raise SessionError(
             f"{folder} holds a generated recording already; choose another folder or overwrite it"
         )
+    _refuse_strange(folder)
     partial = folder.with_name(folder.name + ".partial")
+    before = folder.with_name(folder.name + ".before")
     try:
+        if before.is_dir() and is_generated(before):  # of a run that was killed in between
+            if folder.exists():
+                shutil.rmtree(before)
+            else:
+                before.rename(folder)
         shutil.rmtree(partial, ignore_errors=True)  # left by a run that was killed
         partial.mkdir(parents=True)
     except OSError as error:
@@ -181,12 +191,35 @@ def _appearing(folder: Path, overwrite: bool) -> Iterator[Path]:
     try:
         yield partial
         if folder.exists():
-            shutil.rmtree(folder)
-        partial.rename(folder)
+            folder.rename(before)
+        try:
+            partial.rename(folder)
+        except OSError:
+            if before.exists():
+                before.rename(folder)
+            raise
+        shutil.rmtree(before, ignore_errors=True)
     except OSError as error:
         raise SessionError(f"{folder}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+#: What a generated recording holds, and what is made of it in its folder by other commands.
+_KNOWN = frozenset(("session.toml", "scene.toml", "truth.h5", "meshes", "rig", "silhouettes.h5"))
+
+
+def _refuse_strange(folder: Path) -> None:
+    """Refuse to replace a folder in which somebody has put something."""
+    if not folder.is_dir():
+        return
+    for one in sorted(folder.iterdir()):
+        is_camera = (one / "video.avi").is_file()
+        if one.name not in _KNOWN and not is_camera:
+            raise SessionError(
+                f"{folder}: holds {one.name!r}, which is not of the generated recording; move it "
+                "elsewhere, or choose another folder"
+            )
 
 
 def _record(folder: Path, job: _Job) -> None:
@@ -250,7 +283,7 @@ def _write_still_clips(place: _Place, job: _Job) -> None:
         (_BOARD, "board.avi", floor, N_BOARD_FRAMES),
         (_BACKGROUND, "background.avi", place.empty, N_BACKGROUND_FRAMES),
     ):
-        with _video(place.folder / name, camera, job.preset.fps) as video:
+        with _video(place.folder / name, camera, job.preset.fps, count) as video:
             for frame in range(count):
                 rng = job.rng(what, place.number, frame)
                 video.write(render.expose(picture, job.gain(what, frame), rng))
@@ -300,6 +333,8 @@ def _write_task(
     finally:
         for video in videos:
             video.release()
+    for place in places:
+        _see_whole(place.folder / "video.avi", job.n_frames)
     job.progress("frames", job.n_frames, job.n_frames)
     _write_motion(job, truth, frames, found)
 
@@ -438,12 +473,20 @@ def _open_video(path: Path, camera: Camera, fps: float) -> cv2.VideoWriter:
 
 
 @contextmanager
-def _video(path: Path, camera: Camera, fps: float) -> Iterator[cv2.VideoWriter]:
+def _video(path: Path, camera: Camera, fps: float, count: int) -> Iterator[cv2.VideoWriter]:
     video = _open_video(path, camera, fps)
     try:
         yield video
     finally:
         video.release()
+    _see_whole(path, count)
+
+
+def _see_whole(path: Path, count: int) -> None:
+    """Raise an OSError where a video has not all its frames: OpenCV does not notice a full disk."""
+    found = avi_frames(path)
+    if found is None or found.n_frames != count or found.damaged or found.unreachable:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def _write_toml(folder: Path, job: _Job) -> None:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.board import Board
 from hybridve.calib.boards.printed import printed_board
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import sink
+from hybridve.hull.places import MARK
 
 _MM_PER_INCH = 25.4
 
@@ -104,7 +105,7 @@ def write_boards(path: File, boards: Sequence[Board]) -> list[BoardPage]:
     """
     pages = [draw_board(board) for board in boards]
     try:
-        with appearing(path) as partial, PdfPages(partial) as file:
+        with sink(path) as out, PdfPages(out, metadata={"Creator": MARK}) as file:
             for page in pages:
                 file.savefig(page.figure)
     except OSError as error:

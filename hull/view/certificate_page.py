@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
 from hybridve.calib.judging.certificate import CameraCertificate, Certificate, SeenPoints, Volume
 from hybridve.calib.lens import parameter_names
 from hybridve.calib.rig import Rig, RigCovariance
@@ -158,8 +158,7 @@ def write_certificate_page(
         details=details,
     )
     try:
-        with appearing(path) as partial:
-            partial.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written: {error}") from error
 

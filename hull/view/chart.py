@@ -13,7 +13,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLo
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import sink
+from hybridve.hull.places import MARK
 
 #: What a chart may be written as.
 SUFFIXES = (".png", ".svg", ".pdf")
@@ -144,11 +145,16 @@ def refuse_suffix(path: Path) -> None:
         raise ValueError(f"{path}: charts are {', '.join(SUFFIXES)}")
 
 
+#: Under which name each kind of file says what it was made by.
+_SAYS_WHO = {"png": "Software", "svg": "Creator", "pdf": "Creator"}
+
+
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure, which appears only when it is complete."""
+    kind = path.suffix.lower()[1:]
     try:
-        with appearing(path) as partial:
-            figure.savefig(partial, format=path.suffix.lower()[1:], dpi=_DPI)
+        with sink(path) as file:
+            figure.savefig(file, format=kind, dpi=_DPI, metadata={_SAYS_WHO[kind]: MARK})
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error}") from error
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
 from hybridve.calib.files import appearing
+from hybridve.hull.places import MARK
 
 #: What a film may be written as.
 FILMS = (".mp4",)
@@ -48,6 +49,7 @@ def write_film(path: Path, images: Iterable[NDArray[np.uint8]], fps: float) -> i
             # What is told first stands first, so that a film plays while it is still loaded.
             options = {"movflags": "faststart"}
             with av.open(str(partial), "w", format="mp4", options=options) as container:
+                container.metadata["comment"] = MARK
                 stream = None
                 for image in images:
                     if stream is None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
+from hybridve.hull.places import MARK
 from hybridve.hull.view.surface import Surface
 
 #: What a surface may be written as.
@@ -34,8 +35,7 @@ def write_mesh(path: Path, surface: Surface) -> None:
     """
     content = _ply(surface) if path.suffix.lower() == ".ply" else _glb(surface)
     try:
-        with appearing(path) as partial:
-            partial.write_bytes(content)
+        write_whole(path, content)
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error.strerror}") from error
 
@@ -43,6 +43,7 @@ def write_mesh(path: Path, surface: Surface) -> None:
 def _ply(surface: Surface) -> bytes:
     head = (
         "ply\nformat binary_little_endian 1.0\ncomment metres, z up\n"
+        f"comment {MARK}\n"
         f"element vertex {len(surface.vertices_world)}\n"
         "property double x\nproperty double y\nproperty double z\n"
         f"element face {len(surface.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
@@ -97,7 +98,7 @@ def _glb(surface: Surface) -> bytes:
     return _chunks(told, data)
 
 
-_ASSET = {"version": "2.0", "generator": "hybridve"}
+_ASSET = {"version": "2.0", "generator": MARK}
 
 
 def _chunks(told: dict[str, object], data: bytes) -> bytes:

@@ -3,6 +3,7 @@
 What a person looks at first: cameras, the hull, the CAD, and in red what collides.
 """
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
 from hybridve.calib.rig import Rig
+from hybridve.hull.places import MARK
 from hybridve.hull.query.silhouettes import Hull
 from hybridve.hull.view.cells import hull_cells
 from hybridve.hull.view.drawn import DrawnObject, Marks, Measure
@@ -429,6 +431,21 @@ def contact_sheet(images: list[Image], columns: int) -> Image:
     return sheet
 
 
+def _marked(encoded: bytes) -> bytes:
+    """Return a PNG or JPEG with a remark that it is ours; another file as it is."""
+    text = MARK.encode()
+    if encoded.startswith(b"\x89PNG"):
+        head = 33  # the signature and the chunk that comes first
+        chunk = b"tEXtSoftware\0" + text
+        size, check = len(chunk) - 4, zlib.crc32(chunk)
+        remark = size.to_bytes(4) + chunk + check.to_bytes(4)
+    elif encoded.startswith(b"\xff\xd8"):
+        head, remark = 2, b"\xff\xfe" + (len(text) + 2).to_bytes(2) + text
+    else:
+        return encoded
+    return encoded[:head] + remark + encoded[head:]
+
+
 def write_picture(path: Path, image: Image) -> None:
     """Write a picture; the file appears only when it is complete.
 
@@ -447,8 +464,7 @@ def write_picture(path: Path, image: Image) -> None:
     if not good:
         raise ReportError(f"{path}: the picture could not be encoded as {path.suffix}")
     try:
-        with appearing(path) as partial:
-            partial.write_bytes(encoded.tobytes())
+        write_whole(path, _marked(encoded.tobytes()))
     except OSError as error:
         raise ReportError(
             f"{path}: cannot be written ({error.strerror}); name a place that can"

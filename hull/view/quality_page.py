@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
 from hybridve.hull.agreement.record import NamedCause
 from hybridve.hull.view.packed import webp
 from hybridve.hull.view.pages import page_template
@@ -104,8 +104,7 @@ def write_quality_page(
         usual=[_Shown(one.frame, one.why, webp(one.sheet, _QUALITY)) for one in usual],
     )
     try:
-        with appearing(path) as partial:
-            partial.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error}") from error
 

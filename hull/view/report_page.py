@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.calib.errors import ReportError
-from hybridve.calib.files import appearing
+from hybridve.calib.files import write_whole
 from hybridve.hull.view.pages import page_template
 
 #: How the verdict looks at first sight.
@@ -191,8 +191,7 @@ def write_report_page(path: Path, page: Page) -> int:
     """
     whole = page_text(page).encode("utf-8")
     try:
-        with appearing(path) as partial:
-            partial.write_bytes(whole)
+        write_whole(path, whole)
     except OSError as error:
         raise ReportError(f"{path}: cannot be written: {error.strerror}") from error
     return len(whole)
