@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from hybridve.calib.bounded import has_control, printable
 from hybridve.cli import options
 from hybridve.hull.report.wording import (
     at_95_text,
@@ -135,6 +136,9 @@ def _decisions(
     from hybridve.hull.report.ledger import STATUSES, Decision
     from hybridve.hull.report.machine import utc_now
 
+    for option, text in (("--comment", comment), ("--who", who)):
+        if text is not None and has_control(text):  # what is kept must be read back
+            raise click.UsageError(f"{option} holds a control character, in '{printable(text)}'")
     who = _user() if who is None else who
     found = [
         Decision(name, status, who, utc_now(), comment)

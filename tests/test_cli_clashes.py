@@ -97,6 +97,7 @@ def test_json_has_all_about_a_clash_in_metres(
     [
         (("--approve", "bax-2222"), 1, "there is no clash 'bax-2222'"),
         (("--comment", "why"), 2, "--comment says why"),
+        (("--approve", "x", "--who", "a\x1bb"), 2, r"--who holds a control character, in 'a\x1bb'"),
         (("--approve", "x", "--review", "x"), 2, "x is decided about twice"),
     ],
 )
