@@ -68,6 +68,11 @@ _SHEET_PX = (3200, 2400)
 #: Objects whose clearance is drawn as a line, the worst ones.
 _MOST_MEASURES = 3
 
+#: A picture of some objects shows this many times as much as they fill.
+_AROUND_FOCUS = 1.5
+
+_SIX_WAYS = np.concatenate([np.eye(3), -np.eye(3)])
+
 #: N_hull is drawn so long, metres, or half as long as D_rec.
 _NORMAL_M = 0.05
 _NORMAL_RGB = (0.10, 0.42, 0.62)
@@ -133,8 +138,8 @@ class Look:
         What a report says of the frame: its clearances are drawn, and its words are the caption.
     focus : str
         The objects that it is about, by name or pattern; empty for all.
-    around : float
-        A picture of these shows so many times as much as they fill.
+    reach_m : float
+        A picture of these shows what is so near to the worst point, too.
     zoom : float
         How many times as large.
     images : sequence of C (H, W, 3) uint8 or None
@@ -151,7 +156,7 @@ class Look:
 
     moment: Moment | None = None
     focus: str = ""
-    around: float = 1.5
+    reach_m: float = 0.0
     zoom: float = 1.0
     images: Sequence[Image | None] = ()
     heat: Heat | None = None
@@ -292,7 +297,10 @@ def viewpoint_of(shot: Shot, size_px: tuple[int, int], look: Look) -> Viewpoint:
         points = np.concatenate([one.vertices_world[np.unique(one.faces)] for one in chosen])
         points = np.concatenate([points, *(end[None] for end in ends)])
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        around = middle + look.around * (points - middle)
+        around = middle + _AROUND_FOCUS * (points - middle)
+        at_world = _point_of(shot, look)
+        if look.reach_m and at_world is not None:
+            around = np.concatenate([around, at_world + look.reach_m * _SIX_WAYS])
         focus = Focus(around, tuple(one.name for one in chosen))
     aspect = size_px[0] / size_px[1]
     viewpoint = choose_viewpoint(shot.hull, shot.rig, objects, aspect=aspect, focus=focus)

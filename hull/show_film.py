@@ -35,8 +35,8 @@ from hybridve.hull.view.viewpoint import orbited
 #: Of each clash so much is shown before and after its worst frame, seconds.
 _AROUND_S = 1.0
 
-#: It shows so many times as much as the part fills: who touches it, too.
-_AROUND_CLASH = 5.0
+#: It shows so much about the worst point at least: who touches the part, too.
+_REACH_M = 0.45
 
 #: Clashes that a film shows, the worst.
 _MOST_CLASHES = 6
@@ -198,8 +198,8 @@ def draw_span(
         If no frame is known that it could be looked at from, as a head's poses are of others.
     """
     focus = look.focus or span.focus
-    around = look.around if look.focus else _AROUND_CLASH
-    look = replace(look, focus=focus, around=around, heading=span.heading)
+    reach_m = look.reach_m if look.focus else _REACH_M
+    look = replace(look, focus=focus, reach_m=reach_m, heading=span.heading)
     chain = replace(chain, settings=replace(chain.settings, frames=span.frames))
     still: Viewpoint | None = None
     if isinstance(view, (Outside, Orbit)):

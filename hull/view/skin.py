@@ -24,7 +24,7 @@ Image = NDArray[np.uint8]
 MOST_CAMERAS = 64
 
 #: Within so many pixels of its border a silhouette has the colours of what is behind it.
-_BORDER_PX = 4.0
+_BORDER_PX = 6.0
 
 #: The nearest and the farthest that a camera looks, metres; what is drawn is in the hull's box.
 _RANGE_M = (1e-3, 1e6)

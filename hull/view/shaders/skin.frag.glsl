@@ -103,7 +103,7 @@ void main() {
         float beside = 0.5 + 0.5 * dot(to_eye, to_camera);
         float inner = texture(images, vec3(pixel * texel, float(c))).w;
         float weight = pow(max(beside, 1e-3), SHARPNESS) * (0.02 + 0.98 * facing)
-                     * (0.02 + 0.98 * inner);
+                     * (0.005 + 0.995 * inner * inner);
         if (weight <= SEAM * best) continue;
         weights[c] = weight * seen(c, h, pixel);
         best = max(best, weights[c]);
