@@ -28,7 +28,7 @@ _path = click.Path(path_type=Path)
 
 
 def _files(values: dict[str, Any]) -> options.Files:
-    targets = ("html", "csv", "bcf", "hull_mesh", "vtk")
+    targets = ("html", "csv", "bcf", "rerun", "hull_mesh", "vtk")
     return options.Files(
         reads=options.given(values["report"], values["session"], values["ledger_file"]),
         writes=options.given(*(values[target] for target in targets)),
@@ -58,6 +58,12 @@ def _files(values: dict[str, Any]) -> options.Files:
     type=_path,
     help="The clashes for BIM tools, BCF 3.0: a topic each, with its status, a picture and from "
     "where it is seen. A clash has the same identity in every file.",
+)
+@click.option(
+    "--rerun",
+    type=_path,
+    help="A .rrd for the Rerun viewer: cameras, CAD, collision points, nearest ways and "
+    "clearances over time; with --session the hull. Needs the extra hybridve[rerun].",
 )
 @click.option(
     "--hull-mesh",
@@ -105,6 +111,7 @@ def export(
     html: Path | None,
     csv: Path | None,
     bcf: Path | None,
+    rerun: Path | None,
     hull_mesh: Path | None,
     mesh_format: str,
     cell_mm: float,
@@ -130,14 +137,14 @@ def export(
         return
     if report is None:
         raise click.UsageError("name the report to export")
-    targets = (html, csv, bcf, hull_mesh, vtk)
+    targets = (html, csv, bcf, rerun, hull_mesh, vtk)
     if all(one is None for one in targets):
         raise click.UsageError("say as what: " + ", ".join(one[0] for one in _TARGETS))
-    _refuse_wrong_usage(html, bcf, hull_mesh, vtk, session)
+    _refuse_wrong_usage(html, bcf, rerun, hull_mesh, vtk, session)
     from hybridve.hull.report.read import read_report
     from hybridve.hull.report.write import refuse_existing
 
-    for path in (html, bcf, vtk):
+    for path in (html, bcf, rerun, vtk):
         if path is not None:
             refuse_existing(path, overwrite=overwrite)
     tables = None if csv is None else _table_paths(csv, overwrite=overwrite)
@@ -182,6 +189,16 @@ def export(
             vtk, loaded, recorded=recorded, cell_m=cell_mm / 1e3, progress=terminal.stage
         )
         options.tell(f"{vtk}: {options.counted(len(loaded.index), 'frame')}")
+    if rerun is not None:
+        from hybridve.hull.export_hulls import hull_surfaces
+        from hybridve.hull.export_rerun import write_rerun
+        from hybridve.hull.recorded import rig_of
+
+        surfaces = None
+        if recorded is not None:
+            surfaces = hull_surfaces(loaded, recorded, cell_mm / 1e3, terminal.stage)
+        write_rerun(rerun, loaded, rig_of(loaded, recorded), surfaces)
+        options.tell(f"{rerun}: {options.counted(len(loaded.index), 'frame')}")
     if html is not None:
         from hybridve.hull.page import write_page
 
@@ -200,6 +217,7 @@ def export(
 def _refuse_wrong_usage(
     html: Path | None,
     bcf: Path | None,
+    rerun: Path | None,
     hull_mesh: Path | None,
     vtk: Path | None,
     session: Path | None,
@@ -211,11 +229,13 @@ def _refuse_wrong_usage(
         raise click.UsageError(f"{vtk}: files for ParaView are .vtkhdf")
     if bcf is not None and bcf.suffix.lower() not in (".bcf", ".bcfzip"):
         raise click.UsageError(f"{bcf}: BCF files are .bcf or .bcfzip")
+    if rerun is not None and rerun.suffix.lower() != ".rrd":
+        raise click.UsageError(f"{rerun}: recordings for Rerun are .rrd")
     if hull_mesh is not None and session is None:
         raise click.UsageError("--hull-mesh needs --session SESSION: a report holds no hull")
-    if session is not None and all(one is None for one in (html, bcf, hull_mesh, vtk)):
+    if session is not None and all(one is None for one in (html, bcf, rerun, hull_mesh, vtk)):
         raise click.UsageError(
-            "--session is of --html, --bcf, --hull-mesh and --vtk; give one of them"
+            "--session is of --html, --bcf, --rerun, --hull-mesh and --vtk; give one of them"
         )
 
 

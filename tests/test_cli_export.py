@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -316,9 +317,13 @@ def test_what_there_is_is_listed(run: Run, capsys: pytest.CaptureFixture[str]) -
         ((), "say as what: --html"),
         (("--html", "OUT.pdf"), "OUT.pdf: pages are .html"),
         (("--bcf", "OUT.zip"), "OUT.zip: BCF files are .bcf or .bcfzip"),
+        (("--rerun", "OUT.vtk"), "OUT.vtk: recordings for Rerun are .rrd"),
         (("--vtk", "OUT.vtk"), "OUT.vtk: files for ParaView are .vtkhdf"),
         (("--hull-mesh", "hulls"), "--hull-mesh needs --session SESSION"),
-        (("--session", "s", "--csv", "t"), "--session is of --html, --bcf, --hull-mesh and --vtk"),
+        (
+            ("--session", "s", "--csv", "t"),
+            "--session is of --html, --bcf, --rerun, --hull-mesh and --vtk",
+        ),
     ],
 )
 def test_wrong_usage_is_one_line(
@@ -329,6 +334,20 @@ def test_wrong_usage_is_one_line(
     message: str,
 ) -> None:
     assert message in error_of(run, capsys, report, *arguments, status=2)
+
+
+def test_without_its_library_rerun_says_what_installs_it(
+    run: Run,
+    report: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    line = error_of(run, capsys, report, "--rerun", tmp_path / "r.rrd")
+
+    assert "`pip install hybridve[rerun]` installs it" in line
+    assert not (tmp_path / "r.rrd").exists()
 
 
 @pytest.mark.parametrize("name", ["page.html", "f.csv", "f.clashes.csv", "tables/clashes.csv"])
