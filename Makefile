@@ -8,19 +8,21 @@
 # make bench   the benchmarks at full size, into tests/benchmarks/results.json; ONLY="bench_query" some
 # make theory  calibrate generated rigs hundreds of times; their errors beside the least possible
 # make hard-cases   the table of hard cases in tests/README.md: what each column makes of each row
+# make attack  batches whose workers are killed, runs that are killed, every write made to fail
+# make fuzz    nearly right files for every reader: RUNS=2000 a reader, SEED=0, ONLY=some readers
 # make lock    renew requirements.lock after a change of pyproject.toml
 # make vendor  build what pages bring along (three.js) anew, after a change in .ci/vendor; needs npm
 
 BIN := .venv/bin
 
 # As many processes run as there are cores: threads of linear algebra in each would fight.
-pytest thorough quick coverage oldest soak bench theory hard-cases: export OPENBLAS_NUM_THREADS = 1
+pytest thorough quick coverage oldest soak bench theory hard-cases attack fuzz: export OPENBLAS_NUM_THREADS = 1
 
 # Compiled modules are kept whatever the shell says: compiling them anew costs each process 5 s, and
 # each command that a test starts its share.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check pytest thorough quick coverage oldest soak bench theory hard-cases lock vendor setup \
+.PHONY: demo test check pytest thorough quick coverage oldest soak bench theory hard-cases attack fuzz lock vendor setup \
 	browser clean
 
 demo: setup
@@ -70,6 +72,12 @@ theory: setup
 
 hard-cases: setup
 	PYTHONPATH=tests $(BIN)/python -m helpers.hard_cases_table
+
+attack: setup
+	PYTHONPATH=tests $(BIN)/python tests/attack.py
+
+fuzz: setup
+	PYTHONPATH=tests $(BIN)/python tests/fuzz.py --runs $(or $(RUNS),2000) --seed $(or $(SEED),0) --only "$(ONLY)"
 
 lock: setup
 	$(BIN)/python -m pip install --quiet uv

@@ -1,14 +1,20 @@
 """A batch on a Dask cluster: the extra ``cluster`` (``pip install hybridve[cluster]``)."""
 
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from hybridve.calib.errors import DeviceError
-from hybridve.cli.unit import Job, run_job
+from hybridve.cli.unit import Ended, Job, reason_in
 
 #: How often a task may lose the worker that it runs on: tried once again, as in the pool.
 _STRIKES = 1
+
+#: How often a job is begun that finds its output held by another, and how long it waits between.
+_TRIES, _PAUSE_S = 4, 5.0
 
 
 def run_on_cluster(address: str, jobs: Sequence[Job], ended: Callable[[Job, Any], object]) -> None:
@@ -36,7 +42,7 @@ def run_on_cluster(address: str, jobs: Sequence[Job], ended: Callable[[Job, Any]
             client.submit(_on_worker, job, key=f"hybridve-{job.unit}", pure=False): job
             for job in jobs
         }
-        for future in distributed.as_completed(futures):
+        for future in distributed.as_completed(list(futures), loop=client.loop):
             failure = future.exception()
             ended(futures[future], future.result() if failure is None else _told(failure))
 
@@ -51,12 +57,20 @@ def _told(error: BaseException) -> Exception:
     return RuntimeError(text)
 
 
-def _on_worker(job: Job) -> Any:
-    """Run a job in a process of its own: a worker's threads are not the main one."""
-    import multiprocessing
-    import os
-    from concurrent.futures import ProcessPoolExecutor
-
-    cpus = tuple(sorted(os.sched_getaffinity(0)))
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(run_job, job, cpus).result()
+def _on_worker(job: Job) -> Ended:
+    """Run a job in a process of its own, which ends where the worker dies."""
+    started = time.monotonic()
+    for _ in range(_TRIES):
+        with Path(job.log).open("w", encoding="utf-8") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "hybridve.cli.unit", *job.words],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+            status = process.wait()
+        reason = "" if status == 0 else reason_in(Path(job.log))
+        if "another run is writing it" not in reason:
+            break
+        time.sleep(_PAUSE_S)  # that of a worker that died a moment ago, which is ending
+    return Ended(status, reason, time.monotonic() - started, process.pid)

@@ -86,13 +86,13 @@ def run_job(job: Job, cpus: tuple[int, ...]) -> Ended:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)  # while it waits there is nothing to tidy
     return Ended(
         status,
-        "" if status == 0 else _reason(Path(job.log)),
+        "" if status == 0 else reason_in(Path(job.log)),
         time.monotonic() - started,
         os.getpid(),
     )
 
 
-def _reason(log: Path) -> str:
+def reason_in(log: Path) -> str:
     """Return the first error that a log tells, or its last line."""
     lines = [
         line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line
@@ -107,3 +107,21 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _main() -> None:
+    """Run a command line that ends where whoever began it dies: its input comes to an end."""
+    from hybridve.cli.main import main
+
+    def watch() -> None:
+        # Not through Python's buffer, whose lock would be missed when the program ends.
+        while os.read(0, 1024):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+    main()
+
+
+if __name__ == "__main__":
+    _main()

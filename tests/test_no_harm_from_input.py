@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.clash_reports import Spot, write_clash_report
+from helpers.fuzzing import readers, tried
 from helpers.sessions import write_ball_session, write_cube_scene
 
 from hybridve.calib.bounded import parse_json, printable
@@ -377,3 +378,11 @@ def test_reports_with_flipped_bytes_are_read_or_refused(tmp_path: Path) -> None:
     assert read < 12
     with pytest.raises(SessionError):
         load_session(tmp_path / "0.h5")
+
+
+def test_what_is_nearly_right_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    for reader in readers(tmp_path):
+        if reader.in_libraries:  # `make fuzz` asks these, in processes that may die
+            continue
+        for _, problem in tried(reader, tmp_path, 12, seed=1):
+            assert not problem, reader.name
