@@ -10,7 +10,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
@@ -138,9 +138,10 @@ def _side_by_side(
                 if n_at_once == 1:  # some engines answer the thread that opened them, and no other
                     yield _evaluated(chain, tools, frame, before, looked)
                     continue
-                call = threads.submit(_evaluated, chain, tools, frame, before, looked)
-                waiting.append(call)
-                if len(waiting) > n_at_once:
+                while len(busy := [call for call in waiting if not call.done()]) >= n_at_once:
+                    wait(busy, return_when=FIRST_COMPLETED)
+                waiting.append(threads.submit(_evaluated, chain, tools, frame, before, looked))
+                while waiting and waiting[0].done():
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -10,6 +10,7 @@ from hybridve.hull.query.silhouettes import (
     BACKGROUND,
     OBJECT,
     UNSEEN,
+    Hull,
     Unseen,
     beside,
     interpolated_views,
@@ -240,3 +241,24 @@ def test_images_beside_those_of_a_hull_are_those_of_their_own_hull(unseen: Unsee
             np.testing.assert_array_equal(getattr(both, name), np.concatenate([first, second]))
             np.testing.assert_array_equal(getattr(hull, name), first)
             assert not getattr(both, name).flags.writeable
+
+
+def test_memory_of_images_is_used_again_once_no_part_of_it_is_held() -> None:
+    views = make_views(NAMES, SIZES, ring_matrices(3, np.zeros(3)))
+
+    def address(hull: Hull) -> int:
+        return int(hull.masks_flat.__array_interface__["data"][0])
+
+    masks = [np.ones((480, 640), np.uint8)] * 3
+    first = make_hull(views, masks)
+    held, begin = first.mask(1)[100:], address(first)
+    del first
+    others = [make_hull(views, [np.zeros_like(mask) for mask in masks]) for _ in range(3)]
+    assert begin not in [address(hull) for hull in others]
+    assert held.all()
+
+    del held
+    again = make_hull(views, [np.zeros_like(mask) for mask in masks])
+    assert address(again) == begin
+    assert not again.masks_flat.any()
+    assert not again.integrals_flat.any()

@@ -13,6 +13,9 @@ holds all that a bent lens recorded also has pixels that it did not record (`See
 background to a camera that carves, and nothing to one that abstains.
 """
 
+import mmap
+import weakref
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, TypeVar
@@ -472,6 +475,36 @@ def beside(hull: Hull, masks: list[NDArray[np.uint8]]) -> tuple[Hull, Hull]:
     return other, both
 
 
+#: Pieces of one size, and sizes, of which memory that nobody holds any more is kept.
+_MOST_KEPT, _MOST_SIZES = 2, 6
+
+_kept: dict[int, deque[mmap.mmap]] = {}
+
+
+def _memory(count: int, dtype: type[_Number]) -> NDArray[_Number]:
+    """Return an array (count,) of whatever numbers, to be written to, the first time zeros.
+
+    Its memory is used again once no array holds it. To touch new memory takes the system longer
+    than to fill it with an image: a tenth of a second for a frame of ten cameras.
+    """
+    n_bytes = count * np.dtype(dtype).itemsize
+    try:
+        memory = _kept[n_bytes].pop()
+    except (KeyError, IndexError):
+        memory = mmap.mmap(-1, max(n_bytes, 1))
+    array = np.frombuffer(memory, dtype, count)
+    # Parts of the array hold it, as its memory is not NumPy's own.
+    weakref.finalize(array, _keep, n_bytes, memory).atexit = False
+    return array
+
+
+def _keep(n_bytes: int, memory: mmap.mmap) -> None:
+    """Keep memory that was let go. No lock: this runs wherever the last array happens to go."""
+    if n_bytes not in _kept and len(_kept) >= _MOST_SIZES:
+        _kept.clear()
+    _kept.setdefault(n_bytes, deque(maxlen=_MOST_KEPT)).append(memory)
+
+
 class _Room(NamedTuple):
     """Memory for the images of two hulls, which costs nothing until it is written to."""
 
@@ -484,9 +517,10 @@ class _Room(NamedTuple):
         n_integrals = int((views.sizes_px + 1).prod(axis=1).sum())
         if views.seen is not None:
             n_integrals += len(views.seen.integrals_flat)
-        masks = np.zeros(2 * int(views.sizes_px.prod(axis=1).sum()), np.uint8)
-        answers = masks if views.seen is None else np.zeros_like(masks)
-        return cls(masks, answers, np.zeros(2 * n_integrals, np.int32))
+        n_pixels = int(views.sizes_px.prod(axis=1).sum())
+        masks = _memory(2 * n_pixels, np.uint8)
+        answers = masks if views.seen is None else _memory(2 * n_pixels, np.uint8)
+        return cls(masks, answers, _memory(2 * n_integrals, np.int32))
 
     def half(self, number: int) -> "_Room":
         """Return the first half, 0, or the second, 1."""
