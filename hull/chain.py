@@ -339,7 +339,7 @@ class FrameHull:
     reason : str
         Why it cannot; otherwise empty.
     decode_s, segment_s, hull_s : float
-        What that took.
+        How long threads worked at that.
     """
 
     index: int
@@ -382,7 +382,7 @@ def hulls(
     )
     with closing(found) as frames:
         for frame in frames:
-            started, hull = time.perf_counter(), None
+            started, hull = time.thread_time(), None
             reason = frame.reason or chain.scene.missing(frame.index)
             if frame.masks is not None and not reason:
                 hull = make_hull(views_at(chain, frame.index), frame.masks)
@@ -393,7 +393,7 @@ def hulls(
                 reason=reason,
                 decode_s=frame.decode_s,
                 segment_s=frame.segment_s,
-                hull_s=time.perf_counter() - started,
+                hull_s=time.thread_time() - started,
             )
 
 

@@ -8,7 +8,9 @@
 """
 
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
@@ -39,6 +41,7 @@ from hybridve.hull.query.silhouettes import (
     Hull,
     Views,
 )
+from hybridve.hull.query.threads import usable_cpus
 from hybridve.hull.report.schema import CameraFrame, FrameResult, State
 
 if TYPE_CHECKING:
@@ -57,6 +60,10 @@ from hybridve.hull.chain import (
 )
 from hybridve.hull.trust import Witness
 
+#: Frames are evaluated side by side, as many as there are processors, but no more than this: each
+#: holds its images.
+_MOST_AT_ONCE = 8
+
 
 def evaluate(
     chain: Chain,
@@ -65,8 +72,12 @@ def evaluate(
     skip: int = 0,
     write_s: Callable[[], float] = lambda: 0.0,
     progress: Callable[[str, int, int], None] | None = None,
+    n_at_once: int | None = None,
 ) -> Generator[FrameResult]:
     """Yield the result of every frame; to be closed where it is left before its end.
+
+    Frames are evaluated side by side and yielded in their order. No result depends on how many are
+    evaluated at once, nor on what was evaluated before, but for the frame before.
 
     Parameters
     ----------
@@ -81,62 +92,114 @@ def evaluate(
         Tells how long was spent on writing since it was last asked; kept with the next frame.
     progress : callable, optional
         Told ``(what, done, total)`` while the backgrounds are learnt.
+    n_at_once : int, optional
+        How many frames are evaluated at once; by default as many as there are processors, some at
+        most, but one where the engine answers one thread only.
 
     Raises
     ------
     SessionError
         If the recording has none of the frames asked for.
     """
-    row = first = max(skip - 1, 0)
-    before: _Seen | None = None
+    if n_at_once is None:
+        n_at_once = min(usable_cpus(), _MOST_AT_ONCE) if engine.any_thread else 1
+    first = max(skip - 1, 0)
+    n_frames = 0
     with (
         _Tools.of(chain, engine) as tools,
         closing(hulls(chain, skip=first, progress=progress)) as frames,
+        closing(_side_by_side(chain, tools, frames, n_at_once)) as results,
     ):
-        for frame in frames:
-            watch = _Stopwatch(decode=frame.decode_s, segment=frame.segment_s, agree=frame.hull_s)
-            seen = None if frame.hull is None else _look(chain, tools, frame, frame.hull, watch)
-            state: State = "unread" if seen is None else "evaluated"
-            reason = frame.reason
-            if seen is not None and seen.agreement.is_contradictory:
-                state, reason = "contradictory", seen.agreement.reason
-            if row >= skip:
-                findings: tuple[Finding, ...] = ()
-                if seen is not None and state == "evaluated":
-                    findings = _findings(chain, tools, before, seen, watch)
-                if seen is not None:
-                    seen.standing.let_go()
-                watch.stage_s["write"] = write_s()
-                yield FrameResult(
-                    index=frame.index,
-                    time_s=frame.time_s,
-                    reason=reason,
-                    findings=findings,
-                    stage_s=watch.stage_s,
-                    state=state,
-                    rests_on=seen.rests_on if seen and state == "evaluated" else "",
-                    cameras=() if seen is None else seen.cameras,
-                )
-            is_known = seen is not None and seen.is_believed
-            before = seen if is_known else None
-            row += 1
-    if row == 0:
+        for n_frames, result in enumerate(results, first + 1):
+            if n_frames > skip:
+                result.stage_s["write"] = write_s()
+                yield result
+    if n_frames == 0 and first == 0:
         raise SessionError(
             f"{chain.session.path}: the recording has none of the frames "
             f"{chain.settings.frames}; it may be empty or shorter"
         )
 
 
+def _side_by_side(
+    chain: Chain, tools: "_Tools", frames: Iterable[FrameHull], n_at_once: int
+) -> Generator[FrameResult]:
+    """Yield the results of frames in their order; so many are evaluated at once.
+
+    A frame is compared with the one before as soon as that was looked at: the earlier one has
+    begun by then, so no frame waits for one that waits itself.
+    """
+    looked: Future[_Seen | None] | None = None
+    waiting: deque[Future[FrameResult]] = deque()
+    with ThreadPoolExecutor(n_at_once, "frame") as threads:
+        try:
+            for frame in frames:
+                before, looked = looked, Future()
+                if n_at_once == 1:  # some engines answer the thread that opened them, and no other
+                    yield _evaluated(chain, tools, frame, before, looked)
+                    continue
+                while len(busy := [call for call in waiting if not call.done()]) >= n_at_once:
+                    wait(busy, return_when=FIRST_COMPLETED)
+                waiting.append(threads.submit(_evaluated, chain, tools, frame, before, looked))
+                while waiting and waiting[0].done():
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for call in waiting:
+                call.cancel()
+
+
+def _evaluated(
+    chain: Chain,
+    tools: "_Tools",
+    frame: FrameHull,
+    before: "Future[_Seen | None] | None",
+    looked: "Future[_Seen | None]",
+) -> FrameResult:
+    """Return the result of one frame; `looked` is given what is seen in it by itself."""
+    watch = _Stopwatch(decode=frame.decode_s, segment=frame.segment_s, agree=frame.hull_s)
+    seen: _Seen | None = None
+    try:
+        if frame.hull is not None:
+            seen = _look(chain, tools, frame, frame.hull, watch)
+    except BaseException as error:
+        looked.set_exception(error)
+        raise
+    looked.set_result(seen)
+    state: State = "unread" if seen is None else "evaluated"
+    reason = frame.reason
+    if seen is not None and seen.agreement.is_contradictory:
+        state, reason = "contradictory", seen.agreement.reason
+    findings: tuple[Finding, ...] = ()
+    if seen is not None and state == "evaluated":
+        earlier = None if before is None else before.result()
+        is_known = earlier is not None and earlier.is_believed
+        findings = _findings(chain, tools, earlier if is_known else None, seen, watch)
+    if seen is not None:
+        seen.standing.let_go()
+    return FrameResult(
+        index=frame.index,
+        time_s=frame.time_s,
+        reason=reason,
+        findings=findings,
+        stage_s=watch.stage_s,
+        state=state,
+        rests_on=seen.rests_on if seen and state == "evaluated" else "",
+        cameras=() if seen is None else seen.cameras,
+    )
+
+
 class _Stopwatch:
-    """Seconds by stage."""
+    """Seconds of work of this thread by stage; it does not count waiting for other frames."""
 
     def __init__(self, **stage_s: float) -> None:
         self.stage_s = stage_s
-        self._last = time.perf_counter()
+        self._last = time.thread_time()
 
     def lap(self, stage: str) -> None:
         """Count the time since the last lap to a stage."""
-        now = time.perf_counter()
+        now = time.thread_time()
         self.stage_s[stage] = self.stage_s.get(stage, 0.0) + now - self._last
         self._last = now
 

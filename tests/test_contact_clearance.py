@@ -237,33 +237,22 @@ def test_the_side_of_a_closed_surface() -> None:
     assert (distance < 0).sum() > 1000
 
 
-def test_a_lattice_computes_a_distance_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lattice_computes_a_distance_once() -> None:
     """Corners are shared by neighbours, by levels and by frames."""
-    asked: list[NDArray[np.float64]] = []
-    original = SurfaceDistance.signed
-
-    def counted(
-        surface: SurfaceDistance, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        asked.append(points)
-        return original(surface, points)
-
-    monkeypatch.setattr(SurfaceDistance, "signed", counted)
     lattice = DistanceLattice(SurfaceDistance(*sheet(0.5, 0.0), is_closed=False), 4.0)
     grid = np.array(np.meshgrid(*[np.arange(-3, 4, 2.0)] * 3)).reshape(3, -1).T  # 4 x 4 x 4 cubes
     for _ in range(2):
         cubes = lattice.cubes(grid, 1.0, 0.1)
-        assert sum(len(points) for points in asked) == 5**3
-    lattice.cubes(grid[:1] / 2, 0.5, 0.1)  # an eighth of one: 19 corners are new at most
-    everywhere = np.concatenate(asked)
-    assert len(np.unique(everywhere, axis=0)) == len(everywhere) <= 5**3 + 7
+        assert lattice.corners.n == len(np.unique(cubes.corner)) == 5**3
+    eighth = lattice.cubes(grid[:1] / 2, 0.5, 0.1)  # some of its corners are known
+    assert lattice.corners.n == 5**3 + np.count_nonzero(eighth.corner >= 5**3) <= 5**3 + 7
     octants = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
     corners = grid[:, None] + octants[:, ::-1]  # x changes first
     expected = np.linalg.norm(
         np.concatenate([np.maximum(np.abs(corners[..., :2]) - 0.5, 0), corners[..., 2:]], -1),
         axis=-1,
     )
-    np.testing.assert_allclose(lattice.distance_m[cubes.corner], expected, atol=1e-12)
+    np.testing.assert_allclose(lattice.corners.distance_m[cubes.corner], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("is_closed", [True, False])
@@ -288,12 +277,11 @@ def test_bounds_of_cells_hold_at_every_point_of_them(is_closed: bool) -> None:
             center = cube_center - cube_half_m + (2 * place + 1) * half_m
             lower_m, deepest = bound_cells(
                 center,
-                np.zeros(40, np.bool_),
                 half_m,
                 np.arange(40),
                 cubes,
-                lattice.distance_m,
-                lattice.nearest,
+                lattice.corners.distance_m,
+                lattice.corners.nearest,
                 surface.error_m(16.0),
                 asked,
                 Best(np.full(1, np.inf), np.full(3, np.nan)),

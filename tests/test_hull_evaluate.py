@@ -1,6 +1,7 @@
 """One recording through the whole chain, on a ball whose place is known in every frame."""
 
 import itertools
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 
 from hybridve.hull.cad.scene import load_scene
 from hybridve.hull.capture.session import load_session
-from hybridve.hull.chain import Chain, EvaluateSettings, make_chain
+from hybridve.hull.chain import Chain, EvaluateSettings, Standing, make_chain, standing_at
 from hybridve.hull.contact.clearance import Clearance
 from hybridve.hull.contact.finding import Finding, agreed, signed_clearance
 from hybridve.hull.contact.outline_errors import DoubtSettings
@@ -112,6 +113,38 @@ def test_frames_taken_up_anywhere_are_the_same_to_the_bit(
     rest = list(evaluate(chain_of(session, scene), engine, skip=skip))
 
     assert [bits(result) for result in rest] == [bits(result) for result in results[skip:]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_at_once", [1, 2, 5])
+def test_frames_side_by_side_are_those_one_after_another_to_the_bit(
+    session: Path, scene: Path, results: list[FrameResult], n_at_once: int
+) -> None:
+    with Native(1) as engine:
+        found = list(evaluate(chain_of(session, scene), engine, n_at_once=n_at_once))
+
+    assert [bits(result) for result in found] == [bits(result) for result in results]
+
+
+@pytest.mark.slow
+def test_an_error_in_one_of_the_frames_side_by_side_ends_them_all(
+    session: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(chain: Chain, index: int) -> Standing:
+        if index == 3:
+            raise MemoryError("no room")
+        return standing_at(chain, index)
+
+    monkeypatch.setattr("hybridve.hull.evaluate.standing_at", failing)
+    found: list[int] = []
+    with Native(1) as engine:
+        results = evaluate(chain_of(session, scene), engine, n_at_once=3)
+        indices = (result.index for result in results)
+        with pytest.raises(MemoryError, match="no room"):
+            found.extend(indices)
+
+    assert found == [0, 1, 2]
+    assert not [one.name for one in threading.enumerate() if one.name.startswith("frame")]
 
 
 def test_contact_begins_where_the_object_was_free_a_frame_before(

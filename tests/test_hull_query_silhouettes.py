@@ -10,6 +10,9 @@ from hybridve.hull.query.silhouettes import (
     BACKGROUND,
     OBJECT,
     UNSEEN,
+    Hull,
+    Unseen,
+    beside,
     interpolated_views,
     make_hull,
     make_seen,
@@ -217,3 +220,45 @@ def test_views_between_two_frames_are_of_cameras_that_recorded_the_same() -> Non
     for different in (other, None):
         with pytest.raises(ValueError, match="not of the same"):
             interpolated_views(before, replace(before, seen=different), 0.5)
+
+
+@pytest.mark.parametrize("unseen", ["carve", "keep"])
+def test_images_beside_those_of_a_hull_are_those_of_their_own_hull(unseen: Unseen) -> None:
+    """Whether there was room for them, as the first time, or not."""
+    rng = np.random.default_rng(7)
+    seen = make_seen(NAMES, SIZES, [rng.random((480, 640)) < 0.9, None, None])
+    views = make_views(NAMES, SIZES, ring_matrices(3, np.zeros(3)), unseen, seen=seen)
+    masks, others = (
+        [(rng.random((480, 640)) < 0.5).astype(np.uint8) for _ in NAMES] for _ in range(2)
+    )
+    hull, expected = make_hull(views, masks), make_hull(views, others)
+    own = hull.masks_flat.copy(), hull.answers_flat.copy(), hull.integrals_flat.copy()
+    for _ in range(2):
+        other, both = beside(hull, others)
+        for name, first in zip(("masks_flat", "answers_flat", "integrals_flat"), own, strict=True):
+            second = getattr(expected, name)
+            np.testing.assert_array_equal(getattr(other, name), second)
+            np.testing.assert_array_equal(getattr(both, name), np.concatenate([first, second]))
+            np.testing.assert_array_equal(getattr(hull, name), first)
+            assert not getattr(both, name).flags.writeable
+
+
+def test_memory_of_images_is_used_again_once_no_part_of_it_is_held() -> None:
+    views = make_views(NAMES, SIZES, ring_matrices(3, np.zeros(3)))
+
+    def address(hull: Hull) -> int:
+        return int(hull.masks_flat.__array_interface__["data"][0])
+
+    masks = [np.ones((480, 640), np.uint8)] * 3
+    first = make_hull(views, masks)
+    held, begin = first.mask(1)[100:], address(first)
+    del first
+    others = [make_hull(views, [np.zeros_like(mask) for mask in masks]) for _ in range(3)]
+    assert begin not in [address(hull) for hull in others]
+    assert held.all()
+
+    del held
+    again = make_hull(views, [np.zeros_like(mask) for mask in masks])
+    assert address(again) == begin
+    assert not again.masks_flat.any()
+    assert not again.integrals_flat.any()

@@ -231,6 +231,7 @@ class Logged:
     """
 
     renderer = "none"
+    any_thread = True
 
     def __init__(self, name: str, log: list[Any], clock: "Clock", answer: str = "") -> None:
         self.name = name

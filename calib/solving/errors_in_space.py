@@ -192,18 +192,27 @@ def pixel_covariance(rig: Rig, points_world: NDArray[np.float64]) -> NDArray[np.
     )
 
 
-def _joint_covariance(rig: Rig, derivatives: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the covariance (N, C, 2, C, 2) of images that change so (N, 2, 6 + P) by camera."""
+def _joint_covariance(
+    rig: Rig, derivatives: Sequence[NDArray[np.float64] | None]
+) -> NDArray[np.float64]:
+    """Return the covariance (N, C, 2, C, 2) of images that change so (N, 2, 6 + P) by camera.
+
+    It is 0 of cameras of which that is None.
+    """
     matrix, slices = _matrix(rig), parameter_slices(rig.cameras)
     n_cameras = len(rig.cameras)
-    found = np.zeros((len(derivatives[0]), n_cameras, 2, n_cameras, 2))
-    for i, first in enumerate(derivatives):
-        for j, second in enumerate(derivatives):
+    known = [(camera, one) for camera, one in enumerate(derivatives) if one is not None]
+    n_points = len(known[0][1]) if known else 1
+    found = np.zeros((n_points, n_cameras, 2, n_cameras, 2))
+    for i, first in known:
+        for j, second in known:
             found[:, i, :, j] = first @ matrix[slices[i], slices[j]] @ second.transpose(0, 2, 1)
     return found
 
 
-def undistorted_covariance(rig: Rig, point_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def undistorted_covariance(
+    rig: Rig, point_world: NDArray[np.float64], is_asked: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
     """Return the covariance of where the cameras see a point in images freed of distortion.
 
     Parameters
@@ -212,28 +221,48 @@ def undistorted_covariance(rig: Rig, point_world: NDArray[np.float64]) -> NDArra
         With its covariance.
     point_world : (3,) float64
         A point in metres.
+    is_asked : (C,) bool, optional
+        Of which cameras; by default of all.
 
     Returns
     -------
     (C, 2, C, 2) float64
         Pixels squared of pinhole images with the lenses' focal lengths
-        (`hybridve.calib.lens.undistortion`); NaN where a camera does not see the point.
+        (`hybridve.calib.lens.undistortion`); NaN where a camera does not see the point, 0 where it
+        was not asked.
 
     Raises
     ------
     ValueError
         If the rig has no covariance.
     """
-    derivatives = []
-    for camera in rig.cameras:
-        by_point, by_parameter = image_derivatives(camera, point_world[None])
-        if camera.has_distortion and np.isfinite(by_point).all():
-            rotation, shift = camera.cam_from_world[:, :3], camera.cam_from_world[:, 3]
-            depth_m = rotation[2] @ point_world + shift[2]
-            by_ray = (by_point[0] @ rotation.T)[:, :2] * depth_m
-            by_parameter = camera.pinhole[:2, :2] @ np.linalg.inv(by_ray) @ by_parameter
-        derivatives.append(by_parameter)
-    return np.asarray(_joint_covariance(rig, derivatives)[0])
+    place = tuple(point_world.tolist())
+    asked = [True] * len(rig.cameras) if is_asked is None else is_asked.tolist()
+    return np.asarray(
+        _joint_covariance(
+            rig,
+            [
+                _undistorted_derivatives(camera, place) if is_one_asked else None
+                for camera, is_one_asked in zip(rig.cameras, asked, strict=True)
+            ],
+        )[0]
+    )
+
+
+@lru_cache(maxsize=64)  # of a point more than one thing is asked
+def _undistorted_derivatives(
+    camera: Camera, place: tuple[float, float, float]
+) -> NDArray[np.float64]:
+    """Return how the image (1, 2, 6 + P) of a point, freed of distortion, changes with the rig."""
+    point_world = np.array(place)
+    by_point, by_parameter = image_derivatives(camera, point_world[None])
+    if camera.has_distortion and np.isfinite(by_point).all():
+        rotation, shift = camera.cam_from_world[:, :3], camera.cam_from_world[:, 3]
+        depth_m = rotation[2] @ point_world + shift[2]
+        by_ray = (by_point[0] @ rotation.T)[:, :2] * depth_m
+        by_parameter = camera.pinhole[:2, :2] @ np.linalg.inv(by_ray) @ by_parameter
+    by_parameter.flags.writeable = False
+    return by_parameter
 
 
 def _matrix(rig: Rig) -> NDArray[np.float64]:

@@ -14,18 +14,59 @@ it may, in whatever direction.
   closed means is told in `hybridve.hull.cad.topology`.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridve.hull.cad.predicates import LEAST, within_range
 from hybridve.hull.cad.surface_tree import (
     DISTANCE_ERROR,
+    SurfaceTree,
     are_in_solid,
     closest_on_surface,
     make_tree,
     winding_numbers,
 )
 from hybridve.hull.cad.topology import meeting_faces
+from hybridve.hull.jit import compiled
+
+
+class Surface(NamedTuple):
+    """A surface as compiled loops take it; `SurfaceDistance` has one.
+
+    Attributes
+    ----------
+    tree : SurfaceTree
+        Its triangles.
+    is_closed : bool
+        Whether it bounds a solid.
+    apart_m : float
+        As of `SurfaceDistance`.
+    """
+
+    tree: SurfaceTree
+    is_closed: bool
+    apart_m: float
+
+
+@compiled
+def signed_distances(
+    points: NDArray[np.float64], surface: Surface
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what `SurfaceDistance.signed` does, of points (N, 3) with coordinates below 2^300."""
+    distance_m, nearest, _ = closest_on_surface(points, surface.tree)
+    if surface.is_closed:
+        in_range = points.copy()
+        for i in range(len(points)):
+            for axis in range(3):
+                if abs(points[i, axis]) < LEAST:
+                    in_range[i, axis] = 0.0
+        inside = are_in_solid(in_range, distance_m, surface.apart_m, surface.tree)
+        for i in range(len(points)):
+            if inside[i]:
+                distance_m[i] = -distance_m[i]
+    return distance_m, nearest
 
 
 class SurfaceDistance:
@@ -48,6 +89,8 @@ class SurfaceDistance:
     ----------
     is_closed : bool
         As given.
+    surface : Surface
+        The same for compiled loops.
     apart_m : float
         How far the corners that meet in `solid_faces` are apart: the solid that decides what is
         inside has its surface no farther from the triangles. 0 but for noise.
@@ -81,6 +124,7 @@ class SurfaceDistance:
                 np.linalg.norm(solid[counts] - corners[counts], axis=2).max(initial=0.0)
             )
         self._tree = make_tree(corners, solid)
+        self.surface = Surface(self._tree, is_closed, self.apart_m)
 
     def closest(
         self, points: NDArray[np.float64]
@@ -106,11 +150,9 @@ class SurfaceDistance:
         off the surface (of the solid, see `apart_m`); on it, distances are 0 to `error_m`.
         """
         points = np.ascontiguousarray(points, np.float64)
-        distance_m, nearest, _ = closest_on_surface(points, self._tree)
         if self.is_closed:
-            inside = are_in_solid(within_range(points), distance_m, self.apart_m, self._tree)
-            distance_m[inside] *= -1.0
-        return distance_m, nearest
+            within_range(points)
+        return signed_distances(points, self.surface)
 
     def winding(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return how often a closed surface goes round points (N, 3): an integer each, exactly.

@@ -17,10 +17,13 @@ through the middle of a box is as deep as half the box is thick.
 Distances at corners of cubes depend on the object alone. They are kept from frame to frame, in the
 object's frame, and serve wherever it is moved to: of one that moves (`ClearanceMeter.at`) the hull
 is asked in that frame, as cameras see it that move the other way. What is found depends on the
-hull, the object and its place only, never on what was asked before.
+hull, the object and its place only, never on what was asked before. Several threads may ask one
+meter: they take turns.
 """
 
 import copy
+import threading
+import weakref
 from dataclasses import dataclass
 from typing import Self
 
@@ -29,44 +32,15 @@ from numpy.typing import NDArray
 
 from hybridve.calib.pose import Pose, invert, placed
 from hybridve.hull.cad.distance import SurfaceDistance
-from hybridve.hull.contact.lattice import (
-    FINEST_LEVEL,
-    Best,
-    Cubes,
-    DistanceLattice,
-    bound_cells,
-)
-from hybridve.hull.query.cells import CellFrame, make_cell_frame, split_cells
+from hybridve.hull.contact.lattice import Best, DistanceLattice
+from hybridve.hull.contact.refinement import Level, Space, near_level, refine, root_level
+from hybridve.hull.query.cells import CellFrame, make_cell_frame
 from hybridve.hull.query.engine import checked_vertices
-from hybridve.hull.query.points import are_inside
 from hybridve.hull.query.silhouettes import Hull, seen_from
 
 #: Half of the first root's edge at least, metres, and in sizes of the object. Farther than 16 times
 #: that is not looked.
 _NEAR_M, _REACH_SIZES = 1.0, 2.0
-
-#: Cubes with a half diagonal below this share of the tolerance are not cut any further. Where cones
-#: cross at a glancing angle the hull ends in a blade, which only cubes as thin as it is can tell
-#: from nothing.
-_SMALLEST_CELL = 2.0**-12
-
-#: Cubes of one level at most. More are not cut; the bounds are then farther apart than asked. Fewer
-#: once the hull is certain to reach into the solid: depth is the same all along the middle of a
-#: plate, which may take as many cubes as it is wide and long.
-_MOST_CELLS, _MOST_DEEP_CELLS = 1 << 17, 1 << 14
-
-#: How far apart the bounds at the centre of a cube may be, in tolerances, for the cells within it
-#: to take theirs from its corners.
-_FINE = 1.0 / 8.0
-
-#: Points that look for a deeper one, and how often they move closer together around the deepest.
-_LOOK_POINTS, _LOOKS = 17, 2
-
-#: Cells that are sooner cut than spared by a deeper point.
-_FEW_CELLS = 100
-
-#: Halvings of the root at most; cubes are never as small before they are small enough.
-_MOST_LEVELS = 64
 
 #: What rounding takes from a bound besides the error of the distances: of a root's cubes, and of
 #: points on the way to the world's frame, in lengths of the root and of the way to its origin.
@@ -113,33 +87,7 @@ class Clearance:
         return self.lower_m - depth_upper_m, self.upper_m - depth_lower_m
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Level:
-    """Cells of one size, and the cubes that tell their distances.
-
-    Attributes
-    ----------
-    center : (N, 3) float64
-        Metres, in the object's frame.
-    half_m : float
-        Half of an edge.
-    cube : (N,) int64
-        The cube that holds each.
-    cubes : Cubes
-        With known corners.
-    """
-
-    center: NDArray[np.float64]
-    half_m: float
-    cube: NDArray[np.int64]
-    cubes: Cubes
-
-    def only(self, kept: NDArray[np.bool_]) -> "_Level":
-        """Return some of the cells."""
-        return _Level(self.center[kept], self.half_m, self.cube[kept], self.cubes)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class NearCells:
     """Cubes in which a point of one frame's hull may be nearer to an object than was asked.
 
@@ -148,7 +96,7 @@ class NearCells:
 
     _meter: "ClearanceMeter"
     _asked: CellFrame
-    _level: _Level
+    _level: Level
 
     @property
     def center_world(self) -> NDArray[np.float64]:
@@ -179,7 +127,8 @@ class NearCells:
         Its lower bound holds for what of the hull lies in these cubes.
         """
         best = Best(np.full(1, np.inf), np.full(3, np.nan))
-        lowest_m = self._meter._refine(self._level.only(kept), best, self._asked)
+        with self._meter._turn:
+            lowest_m = self._meter._refine(self._level.only(kept), best, self._asked)
         return self._meter._found(best, lowest_m, np.zeros(3))
 
 
@@ -247,12 +196,18 @@ class ClearanceMeter:
         exponent = int(np.ceil(np.log2(max(_NEAR_M, _REACH_SIZES * size_m))))
         self._roots_m = [2.0 ** (exponent + more) for more in (0, 2, 4)]
         self._lattice = DistanceLattice(self._surface, self._roots_m[-1])
-        self._rounding_m = self._surface.error_m(_FARTHEST * self._roots_m[-1])
+        self._turn = threading.Lock()
+        # While there are some, the corners of their cubes are not forgotten.
+        self._near: weakref.WeakSet[NearCells] = weakref.WeakSet()
+        rounding_m = self._surface.error_m(_FARTHEST * self._roots_m[-1])
+        self._space = Space(
+            self._surface.surface, self._roots_m[-1], rounding_m, float(tolerance_m)
+        )
         # Distances are to the triangles; the surface that decides about inside may be `apart_m`
         # from them.
         self.error_m = self._error_at_rest_m = (
             self._surface.apart_m
-            + self._rounding_m
+            + rounding_m
             + _ROUNDOFF * (self._roots_m[-1] + float(np.abs(self._origin).max()))
         )
 
@@ -338,16 +293,17 @@ class ClearanceMeter:
         if self.world_from_rest is not None:
             shift_rest = self.world_from_rest[:, :3].T @ shift_rest
         asked = self._asked(hull, shift_rest)
-        if self._lattice.is_large:
-            self._lattice.forget()
         best = Best(np.full(1, np.inf), np.full(3, np.nan))
-        # Most of the hull is near: space is looked through in ever larger cubes about the object,
-        # until what may be beyond them does not matter.
-        for root_m in self._roots_m:
-            beyond_m = root_m - self._size_m
-            lowest_m = self._search(root_m, best, asked, stop_above_m, stop_below_m)
-            if best.distance_m[0] <= beyond_m or min(lowest_m, beyond_m) > stop_above_m:
-                break
+        with self._turn:
+            if self._lattice.is_large and not self._near:
+                self._lattice.forget()
+            # Most of the hull is near: space is looked through in ever larger cubes about the
+            # object, until what may be beyond them does not matter.
+            for root_m in self._roots_m:
+                beyond_m = root_m - self._size_m
+                lowest_m = self._search(root_m, best, asked, stop_above_m, stop_below_m)
+                if best.distance_m[0] <= beyond_m or min(lowest_m, beyond_m) > stop_above_m:
+                    break
         return self._found(best, min(lowest_m, beyond_m), shift_rest)
 
     def _found(self, best: Best, lowest_m: float, shift_rest: NDArray[np.float64]) -> Clearance:
@@ -385,7 +341,8 @@ class ClearanceMeter:
         Returns a lower bound of the signed distance of any point of the hull in it, unless that is
         the distance of `best` itself; inf if it holds none.
         """
-        return self._refine(self._root(root_m), best, asked, stop_above_m, stop_below_m)
+        level, self._lattice.corners = root_level(root_m, self._space, self._lattice.corners)
+        return self._refine(level, best, asked, stop_above_m, stop_below_m)
 
     def near_cells(self, hull: Hull, within_m: float, cell_m: float, most: int) -> "NearCells":
         """Return the cubes in which a point of the hull may be nearer to the object than asked.
@@ -405,146 +362,32 @@ class ClearanceMeter:
         root_m = next(
             (root for root in self._roots_m if root - self._size_m > within_m), self._roots_m[-1]
         )
-        level, best = self._root(root_m), Best(np.full(1, np.inf), np.full(3, np.nan))
-        while 2.0 * level.half_m > cell_m:
-            level, lower_m, _ = self._split(level, asked, best)
-            level = level.only(lower_m <= within_m)
-            if len(level.center) > most:
-                break
-        return NearCells(self, asked, level)
-
-    def _root(self, root_m: float) -> "_Level":
-        center = np.zeros((1, 3))
-        cubes = self._lattice.cubes(center, root_m, _FINE * self.tolerance_m)
-        return _Level(center, root_m, np.zeros(1, np.int64), cubes)
-
-    def _split(
-        self, level: "_Level", asked: CellFrame, best: Best
-    ) -> tuple["_Level", NDArray[np.float64], int]:
-        """Return the parts of cells that are not free, their bounds, and the deepest of them."""
-        half_m, cubes = level.half_m / 2.0, level.cubes
-        whole, center, inside = split_cells(level.center, half_m, asked)
-        cube = level.cube[whole]
-        is_finest = half_m < self._roots_m[-1] / 2.0**FINEST_LEVEL
-        if not is_finest:
-            own = ~cubes.is_fine[cube]
-            cube[own] = len(cubes.half_m) + np.arange(int(own.sum()))
-            more = self._lattice.cubes(center[own], half_m, _FINE * self.tolerance_m)
-            cubes = _joined(cubes, more)
-        lower_m, deepest = bound_cells(
-            center,
-            inside,
-            half_m,
-            cube,
-            cubes,
-            self._lattice.distance_m,
-            self._lattice.nearest,
-            self._rounding_m,
-            asked,
-            best,
-        )
-        if is_finest:
-            self._bound_singly(center, inside, half_m, ~cubes.is_fine[cube], lower_m, best)
-        return _Level(center, half_m, cube, cubes), lower_m, deepest
+        lattice, space = self._lattice, self._space
+        with self._turn:
+            level, lattice.corners = root_level(root_m, space, lattice.corners)
+            level, lattice.corners = near_level(
+                level, float(within_m), float(cell_m), most, asked, space, lattice.corners
+            )
+            found = NearCells(self, asked, level)
+            self._near.add(found)
+        return found
 
     def _refine(
         self,
-        level: "_Level",
+        level: Level,
         best: Best,
         asked: CellFrame,
         stop_above_m: float = np.inf,
         stop_below_m: float = -np.inf,
     ) -> float:
         """Look for the hull's nearest point in cells, better than `best`; as `_search`."""
-        dropped_m, lowest_m = np.inf, -np.inf
-        for _ in range(_MOST_LEVELS):
-            level, lower_m, deepest = self._split(level, asked, best)
-            center, half_m = level.center, level.half_m
-            if deepest >= 0:
-                n_looks = _LOOKS if len(center) > _FEW_CELLS else 0
-                self._look_deeper(best, center[deepest], half_m, asked, n_looks)
-            kept = lower_m < best.distance_m[0] - self.tolerance_m
-            dropped_m = min(dropped_m, lower_m[~kept].min(initial=np.inf))
-            lowest_m = lower_m[kept].min(initial=np.inf)
-            level = level.only(kept)
-            center = level.center
-            if (
-                len(center) == 0
-                or np.sqrt(3.0) * half_m < _SMALLEST_CELL * self.tolerance_m
-                or len(level.center)
-                > (_MOST_CELLS if best.distance_m[0] >= 0 else _MOST_DEEP_CELLS)
-                or min(lowest_m, dropped_m, best.distance_m[0]) > stop_above_m
-                or best.distance_m[0] < stop_below_m
-            ):
-                break
-        return float(min(dropped_m, lowest_m))
-
-    def _bound_singly(
-        self,
-        center: NDArray[np.float64],
-        inside: NDArray[np.bool_],
-        half_m: float,
-        is_coarse: NDArray[np.bool_],
-        lower_m: NDArray[np.float64],
-        best: Best,
-    ) -> None:
-        """Raise bounds of cells that no cube of the lattice bounds well, by their own distances.
-
-        The smallest cubes are a share of the root. An object far larger than the room about the
-        hull has a root to match, and one far smaller than a metre a root of metres: cells are then
-        cut on below the smallest cubes.
-        """
-        coarse = np.flatnonzero(is_coarse)
-        signed_m, _ = self._surface.signed(center[coarse])
-        lower_m[coarse] = np.maximum(lower_m[coarse], signed_m - np.sqrt(3.0) * half_m)
-        signed_m[~inside[coarse]] = np.inf
-        nearest = int(signed_m.argmin()) if len(coarse) else -1
-        if nearest >= 0 and signed_m[nearest] < best.distance_m[0]:
-            best.distance_m[0], best.point[:] = signed_m[nearest], center[coarse[nearest]]
-
-    def _look_deeper(
-        self,
-        best: Best,
-        point: NDArray[np.float64],
-        half_m: float,
-        asked: CellFrame,
-        n_looks: int,
-    ) -> None:
-        """Look at a point (3,) of the hull, at the surface beside it, and behind that.
-
-        On the way from the surface through the point into the solid, the depth grows by a metre a
-        metre until another side of the solid is as near. What is found is taken if it betters the
-        best point; its distance is exact.
-        """
-        signed_m, nearest = self._surface.signed(point[None])
-        if signed_m[0] > 0 and are_inside(nearest, asked.offset_local, asked.frame)[0]:
-            if best.distance_m[0] > 0:
-                best.distance_m[0], best.point[:] = 0.0, nearest[0]
-        elif signed_m[0] < best.distance_m[0]:
-            best.distance_m[0], best.point[:] = signed_m[0], point
-        away = point - nearest[0]
-        length_m = float(np.linalg.norm(away))
-        if length_m == 0:
-            return
-        away *= np.copysign(1.0, -signed_m[0]) / length_m
-        begin_m, reach_m = 0.0, 2.0 * half_m
-        for _ in range(n_looks):
-            along_m = begin_m + reach_m * np.linspace(0.0, 1.0, _LOOK_POINTS)
-            points = point + along_m[:, None] * away
-            inside = are_inside(points, asked.offset_local, asked.frame)
-            if not inside.any():
-                return
-            signed_m, _ = self._surface.signed(points)
-            signed_m[~inside] = np.inf
-            deepest = int(signed_m.argmin())
-            if signed_m[deepest] < best.distance_m[0]:
-                best.distance_m[0], best.point[:] = signed_m[deepest], points[deepest]
-            reach_m *= 2.0 / (_LOOK_POINTS - 1)
-            begin_m = max(along_m[deepest] - reach_m / 2.0, 0.0)
-
-
-def _joined(first: Cubes, second: Cubes) -> Cubes:
-    """Return the cubes of both, in order."""
-    if len(second.half_m) == 0:
-        return first
-    return Cubes(*(np.concatenate([a, b]) for a, b in zip(first, second, strict=True)))
+        lowest_m, self._lattice.corners = refine(
+            level,
+            best,
+            asked,
+            self._space,
+            self._lattice.corners,
+            float(stop_above_m),
+            float(stop_below_m),
+        )
+        return float(lowest_m)

@@ -39,7 +39,7 @@ from scipy import ndimage
 
 from hybridve.hull.query.bounds import FREE, FULL
 from hybridve.hull.query.cells import cube_bounds, cube_verdicts, make_cell_frame
-from hybridve.hull.query.silhouettes import Hull, Views, make_hull
+from hybridve.hull.query.silhouettes import Hull, Views, beside, make_hull
 from hybridve.hull.query.walk import contains_few, spans_in_hull
 
 #: By how much silhouettes are grown: a thing's outline is within a pixel of its sampled one.
@@ -76,14 +76,23 @@ NOWHERE = -1
 
 def grown(hull: Hull, by_px: int = GROWN_PX) -> Hull:
     """Return the hull of silhouettes that are larger by some pixels all round (and diagonally)."""
+    return make_hull(hull.views, _grown_masks(hull, by_px))
+
+
+def grown_beside(hull: Hull) -> tuple[Hull, Hull]:
+    """Return the hull of silhouettes grown by `GROWN_PX`, and the first with the images of both.
+
+    See `hybridve.hull.query.silhouettes.beside`.
+    """
+    return beside(hull, _grown_masks(hull, GROWN_PX))
+
+
+def _grown_masks(hull: Hull, by_px: int) -> list[NDArray[np.uint8]]:
     around = np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)
-    return make_hull(
-        hull.views,
-        [
-            np.asarray(cv2.dilate(hull.mask(camera), around), np.uint8)
-            for camera in range(len(hull.views))
-        ],
-    )
+    return [
+        np.asarray(cv2.dilate(hull.mask(camera), around), np.uint8)
+        for camera in range(len(hull.views))
+    ]
 
 
 def pixel_rays(

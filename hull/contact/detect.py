@@ -110,6 +110,8 @@ class Contact:
 
     def some_points(self, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
         """Return every k-th collision point, at most so many; as `points`."""
+        if self.n_points <= most:
+            return self.points()
         return self._placed(*self.hits.thinned(most))
 
     def end_points(self) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridve.hull.cad.distance import SurfaceDistance
+from hybridve.hull.cad.distance import Surface, SurfaceDistance, signed_distances
 from hybridve.hull.jit import ZERO, compiled
 from hybridve.hull.query.cells import CellFrame
 from hybridve.hull.query.points import EDGE_PX, is_inside
@@ -78,6 +78,31 @@ class Cubes(NamedTuple):
     is_fine: NDArray[np.bool_]
 
 
+class Corners(NamedTuple):
+    """What is known of distances at corners, as compiled loops take it.
+
+    Arrays have room for more, and are written to; what returns another one has moved to larger
+    ones, and the first is of no use any more.
+
+    Attributes
+    ----------
+    key, number : (K,) int64
+        A table of places and the numbers of their corners, K a power of two; -1 for a free key.
+    distance_m : (V,) float64
+        Signed distance of a corner.
+    nearest : (V, 3) float64
+        The point of the surface that is nearest to it.
+    n : int
+        How many corners there are.
+    """
+
+    key: NDArray[np.int64]
+    number: NDArray[np.int64]
+    distance_m: NDArray[np.float64]
+    nearest: NDArray[np.float64]
+    n: int
+
+
 class DistanceLattice:
     """Signed distances at corners of cubes about the origin, computed when first asked for.
 
@@ -92,79 +117,101 @@ class DistanceLattice:
 
     Attributes
     ----------
-    distance_m : (V,) float64
-        Signed distance of a corner; the array has room for more.
-    nearest : (V, 3) float64
-        The point of the surface that is nearest to it.
+    corners : Corners
+        Those that are known. Compiled loops that learn more return what takes its place.
     """
 
     def __init__(self, surface: SurfaceDistance, root_half_m: float) -> None:
-        self._surface = surface
+        self._surface = surface.surface
         self._root_half_m = root_half_m
         self.forget()
 
     def forget(self) -> None:
         """Start again without a corner."""
-        self.n_corners = 0
-        self._key = np.full(1 << 12, -1, np.int64)
-        self._number = np.zeros(1 << 12, np.int64)
-        self.distance_m = np.zeros(1 << 11)
-        self.nearest = np.zeros((1 << 11, 3))
+        self.corners = Corners(
+            np.full(1 << 12, -1, np.int64),
+            np.zeros(1 << 12, np.int64),
+            np.zeros(1 << 11),
+            np.zeros((1 << 11, 3)),
+            0,
+        )
 
     @property
     def is_large(self) -> bool:
         """Whether it is time to forget."""
-        return self.n_corners > _MOST_CORNERS
+        return self.corners.n > _MOST_CORNERS
 
     def cubes(self, center: NDArray[np.float64], half_m: float, fine_m: float) -> Cubes:
-        """Return cubes with their corners, at most `FINEST_LEVEL` halvings below the root.
-
-        Parameters
-        ----------
-        center : (M, 3) float64
-            Metres.
-        half_m : float
-            Half of an edge of each.
-        fine_m : float
-            How far apart bounds may be for `Cubes.is_fine`.
-        """
-        self._make_room(8 * len(center))
-        step_m = 2.0 * self._root_half_m / 2.0**FINEST_LEVEL
-        corner, n_corners = _corner_numbers(
-            center, half_m, self._root_half_m, step_m, self._key, self._number, self.n_corners
+        """Return cubes with their corners; as `known_cubes`."""
+        cubes, self.corners = known_cubes(
+            center, half_m, self._root_half_m, fine_m, self._surface, self.corners
         )
-        if n_corners > self.n_corners:
-            points = _corner_points(
-                center, half_m, corner, self.n_corners, n_corners - self.n_corners
-            )
-            new = slice(self.n_corners, n_corners)
-            self.distance_m[new], self.nearest[new] = self._surface.signed(points)
-            self.n_corners = n_corners
-        side, is_fine = _judge(
-            center,
-            half_m,
-            corner,
-            self.distance_m,
-            self.nearest,
-            self._surface.is_closed,
-            self._surface.apart_m,
-            fine_m,
-        )
-        return Cubes(center, np.full(len(center), half_m), corner, side, is_fine)
+        return cubes
 
-    def _make_room(self, n_more: int) -> None:
-        needed = self.n_corners + n_more
-        if 2 * needed > len(self._key):
-            size = len(self._key)
-            while 2 * needed > size:
-                size *= 2
-            grown, number = np.full(size, -1, np.int64), np.zeros(size, np.int64)
-            _rehash(self._key, self._number, grown, number)
-            self._key, self._number = grown, number
-        if needed > len(self.distance_m):
-            grown_m = max(needed, 2 * len(self.distance_m)) - len(self.distance_m)
-            self.distance_m = np.concatenate([self.distance_m, np.zeros(grown_m)])
-            self.nearest = np.concatenate([self.nearest, np.zeros((grown_m, 3))])
+
+@compiled
+def known_cubes(
+    center: NDArray[np.float64],
+    half_m: float,
+    root_half_m: float,
+    fine_m: float,
+    surface: Surface,
+    corners: Corners,
+) -> tuple[Cubes, Corners]:
+    """Return cubes with their corners, and all corners known by then.
+
+    Parameters
+    ----------
+    center : (M, 3) float64
+        Metres.
+    half_m : float
+        Half of an edge of each, at most `FINEST_LEVEL` halvings below the root's.
+    root_half_m : float
+        Half of an edge of the root.
+    fine_m : float
+        How far apart bounds may be for `Cubes.is_fine`.
+    surface : Surface
+        Whose distances are known.
+    corners : Corners
+        Those that are known; not to be used again.
+    """
+    key, number, distance_m, nearest = _with_room(corners, 8 * len(center))
+    step_m = 2.0 * root_half_m / 2.0**FINEST_LEVEL
+    corner, n = _corner_numbers(center, half_m, root_half_m, step_m, key, number, corners.n)
+    if n > corners.n:
+        points = _corner_points(center, half_m, corner, corners.n, n - corners.n)
+        found_m, found = signed_distances(points, surface)
+        distance_m[corners.n : n] = found_m
+        nearest[corners.n : n] = found
+    side, is_fine = _judge(
+        center, half_m, corner, distance_m, nearest, surface.is_closed, surface.apart_m, fine_m
+    )
+    cubes = Cubes(center, np.full(len(center), half_m), corner, side, is_fine)
+    return cubes, Corners(key, number, distance_m, nearest, n)
+
+
+@compiled
+def _with_room(
+    corners: Corners, n_more: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the arrays of corners with room for so many more."""
+    key, number = corners.key, corners.number
+    distance_m, nearest = corners.distance_m, corners.nearest
+    needed = corners.n + n_more
+    size = len(key)
+    while 2 * needed > size:
+        size *= 2
+    if size > len(key):
+        grown, new_number = np.full(size, -1, np.int64), np.zeros(size, np.int64)
+        _rehash(key, number, grown, new_number)
+        key, number = grown, new_number
+    if needed > len(distance_m):
+        size = max(needed, 2 * len(distance_m))
+        grown_m, grown_nearest = np.zeros(size), np.zeros((size, 3))
+        grown_m[: corners.n] = distance_m[: corners.n]
+        grown_nearest[: corners.n] = nearest[: corners.n]
+        distance_m, nearest = grown_m, grown_nearest
+    return key, number, distance_m, nearest
 
 
 @compiled
@@ -362,7 +409,6 @@ class Best(NamedTuple):
 @compiled
 def bound_cells(
     center: NDArray[np.float64],
-    inside: NDArray[np.bool_],
     half_m: float,
     cube: NDArray[np.int64],
     cubes: Cubes,
@@ -378,8 +424,6 @@ def bound_cells(
     ----------
     center : (N, 3) float64
         The cells' centres, metres, in the surface's frame.
-    inside : (N,) bool
-        Which of these are in the hull.
     half_m : float
         Half of an edge of the cells.
     cube : (N,) int64
@@ -442,7 +486,21 @@ def bound_cells(
                 off_z = abs(z - cubes.center[k, 2] - (big if octant & 4 else -big)) + half_m
                 away_m = np.sqrt(off_x * off_x + off_y * off_y + off_z * off_z)
                 lower_m[i] = max(lower_m[i], distance_m[corner[octant]] - away_m)
-        if not inside[i] or lower_m[i] >= smallest_m:
+        if lower_m[i] >= smallest_m or not is_inside(
+            x + offset_x,
+            y + offset_y,
+            z + offset_z,
+            every,
+            len(every),
+            ZERO,
+            matrices,
+            sizes,
+            answers,
+            mask_offset,
+            keep,
+            min_cameras,
+            EDGE_PX,
+        ):
             continue
         if side != _OUTSIDE:
             if lower_m[i] < key:

@@ -94,24 +94,34 @@ class OutlineErrors:
         """
         if self.rig is None or not m_per_px.any():
             return 0.0
-        covariance = self.calibration_covariance_px2(point_world, normals_px)
+        covariance = self.calibration_covariance_px2(point_world, normals_px, m_per_px != 0.0)
         return max(0.0, float(m_per_px @ covariance @ m_per_px))
 
     def calibration_covariance_px2(
-        self, point_world: NDArray[np.float64], normals_px: NDArray[np.float64]
+        self,
+        point_world: NDArray[np.float64],
+        normals_px: NDArray[np.float64],
+        is_asked: NDArray[np.bool_],
     ) -> NDArray[np.float64]:
         """Return what the rig's covariance makes of outlines, along their normals: (C, C), px^2.
 
-        Parameters are those of `calibration_variance_m2`. It is zero without a covariance.
+        It is zero without a covariance, and of cameras that are not asked.
+
+        Parameters
+        ----------
+        point_world, normals_px
+            As of `calibration_variance_m2`.
+        is_asked : (C,) bool
+            Of which cameras.
         """
         n_cameras = len(normals_px)
         if self.rig is None:
             return np.zeros((n_cameras, n_cameras))
-        covariance = np.nan_to_num(undistorted_covariance(self.rig, point_world))
+        covariance = np.nan_to_num(undistorted_covariance(self.rig, point_world, is_asked))
         is_known = np.asarray(np.isfinite(normals_px).all(axis=1))
         normals = np.where(is_known[:, None], normals_px, 0.0)
         along_px2 = np.asarray(np.einsum("ki,kilj,lj->kl", normals, covariance, normals))
-        for camera in np.flatnonzero(~is_known):
+        for camera in np.flatnonzero(~is_known & is_asked):
             along_px2[camera, camera] = np.trace(covariance[camera, :, camera]) / 2.0
         return along_px2
 

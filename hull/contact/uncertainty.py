@@ -78,7 +78,7 @@ from hybridve.hull.contact.components import (
     Volumes,
     connected_volumes,
     cover,
-    grown,
+    grown_beside,
     is_real,
     is_real_at,
 )
@@ -232,9 +232,13 @@ class FrameDoubts:
     _is_real: dict[int, bool] = field(default_factory=dict, init=False)
 
     @cached_property
+    def _beside(self) -> tuple[Hull, Hull]:
+        return grown_beside(self.hull)
+
+    @property
     def grown(self) -> Hull:
         """The hull of silhouettes grown by one pixel."""
-        return grown(self.hull)
+        return self._beside[0]
 
     @cached_property
     def volumes(self) -> Volumes:
@@ -338,7 +342,7 @@ class FrameDoubts:
             if len(ways_m) > 1:
                 covariance_px2 = np.diag(errors.sigma_px**2)
                 covariance_px2 += errors.calibration_covariance_px2(
-                    clearance.on_hull_world, normals_px
+                    clearance.on_hull_world, normals_px, np.asarray(ways_m.any(axis=0))
                 )
                 too_large_m = max(too_large_m, any_beyond(ways_m, covariance_px2))
         return Deviation(std_m, too_large_m, m_per_px, is_remeasured)
@@ -377,16 +381,6 @@ class FrameDoubts:
                 sensitivity_m[camera] = max(0.0, clearance.signed_m[1] - then.signed_m[1])
         return sensitivity_m, True, unknown
 
-    @cached_property
-    def _both(self) -> Hull:
-        """The hull, with the images of the grown one behind its own."""
-        return replace(
-            self.hull,
-            masks_flat=np.concatenate([self.hull.masks_flat, self.grown.masks_flat]),
-            answers_flat=np.concatenate([self.hull.answers_flat, self.grown.answers_flat]),
-            integrals_flat=np.concatenate([self.hull.integrals_flat, self.grown.integrals_flat]),
-        )
-
     def _grown_in(self, camera: int) -> Hull:
         """Return the hull with one camera's silhouette grown by a pixel; images are shared."""
         mask_offset, integral_offset = (
@@ -395,7 +389,7 @@ class FrameDoubts:
         )
         mask_offset[camera] = len(self.hull.masks_flat) + self.grown.mask_offset[camera]
         integral_offset[camera] = len(self.hull.integrals_flat) + self.grown.integral_offset[camera]
-        return replace(self._both, mask_offset=mask_offset, integral_offset=integral_offset)
+        return replace(self._beside[1], mask_offset=mask_offset, integral_offset=integral_offset)
 
     def _contact_hinges_on(self, points_world: NDArray[np.float64]) -> tuple[str, ...]:
         """Return the cameras without which no known point of a contact is left."""

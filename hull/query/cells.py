@@ -20,8 +20,9 @@ times as much over w_min (B_k as in `bounds`, u the unit roundoff), so that a re
 widened by 40 u (B_x + |p_x| B_z) / w_min holds the pixel of every point of the cube, and of every
 point that is computed within 16 u of one.
 
-A centre is called *inside* only where it keeps `points.EDGE_PX` from the edges of its pixel in
-every camera: whoever asks again gets the same answer.
+Whether a cell's centre is in the hull is asked with `points.are_inside`: it is called so only where
+it keeps `points.EDGE_PX` from the edges of its pixel in every camera, so that whoever asks again
+gets the same answer.
 """
 
 from typing import NamedTuple
@@ -40,7 +41,7 @@ from hybridve.hull.query.boxes import (
     rectangle_vote,
 )
 from hybridve.hull.query.frame import Frame
-from hybridve.hull.query.points import EDGE_PX, is_inside, project
+from hybridve.hull.query.points import project
 from hybridve.hull.query.silhouettes import Hull
 
 _PAD = 40.0 * 2.0**-53
@@ -271,7 +272,7 @@ def cube_bounds(
 @compiled
 def split_cells(
     center: NDArray[np.float64], half_m: float, asked: CellFrame
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Cut cells into eight and return the parts that are not proved free.
 
     Parameters
@@ -289,29 +290,24 @@ def split_cells(
         The cell that each part is of, ascending.
     center : (K, 3) float64
         The centres of the parts.
-    inside : (K,) bool
-        Which of these are in the hull.
     """
     frame, pads = asked.frame, asked.pads
     offset_x, offset_y, offset_z = asked.offset_local
     matrices, sizes, integrals = frame.matrices, frame.sizes, frame.integrals
-    answers, mask_offset = frame.answers, frame.mask_offset
-    integral_offset, recorded, every = frame.integral_offset, frame.recorded, frame.every
-    keep, min_cameras, n_cameras = frame.keep, frame.min_cameras, len(frame.matrices)
+    integral_offset, recorded = frame.integral_offset, frame.recorded
+    keep, min_cameras = frame.keep, frame.min_cameras
     whole = np.zeros(8 * len(center), np.int64)
     part_center = np.zeros((8 * len(center), 3))
-    inside = np.zeros(8 * len(center), np.bool_)
     n_parts = 0
     for i in range(len(center)):
         for octant in range(8):
             cell_x = center[i, 0] + (half_m if octant & 1 else -half_m)
             cell_y = center[i, 1] + (half_m if octant & 2 else -half_m)
             cell_z = center[i, 2] + (half_m if octant & 4 else -half_m)
-            x, y, z = cell_x + offset_x, cell_y + offset_y, cell_z + offset_z
             verdict = cube_verdict(
-                x,
-                y,
-                z,
+                cell_x + offset_x,
+                cell_y + offset_y,
+                cell_z + offset_z,
                 half_m,
                 matrices,
                 pads,
@@ -328,20 +324,5 @@ def split_cells(
             part_center[n_parts, 0] = cell_x
             part_center[n_parts, 1] = cell_y
             part_center[n_parts, 2] = cell_z
-            inside[n_parts] = is_inside(
-                x,
-                y,
-                z,
-                every,
-                n_cameras,
-                ZERO,
-                matrices,
-                sizes,
-                answers,
-                mask_offset,
-                keep,
-                min_cameras,
-                EDGE_PX,
-            )
             n_parts += 1
-    return whole[:n_parts], part_center[:n_parts], inside[:n_parts]
+    return whole[:n_parts], part_center[:n_parts]

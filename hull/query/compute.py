@@ -176,6 +176,7 @@ class Compute(Closing):
     """
 
     name = "compute"
+    any_thread = False
 
     def __init__(self, context: moderngl.Context | None = None, *, reject: bool = True) -> None:
         self._is_closed = False

@@ -315,10 +315,13 @@ class Engine(Protocol):
         The engine's room.
     renderer : str
         What does the work on this machine, for reports.
+    any_thread : bool
+        Whether any thread may ask it, also several at once; else only the one that opened it.
     """
 
     name: str
     renderer: str
+    any_thread: bool
 
     def query(self, hull: Hull, meshes: list[Triangles]) -> list[Hits]:
         """Return for each mesh its samples inside the hull of this frame."""

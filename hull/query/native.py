@@ -524,6 +524,7 @@ class Native(Closing):
     """
 
     name = "native"
+    any_thread = True
 
     def __init__(self, n_threads: int | None = None, *, reject: bool = True) -> None:
         self._threads = Threads(n_threads)

@@ -79,6 +79,7 @@ class Reference(Closing):
     """The engine that asks `contains_points` of every sample."""
 
     name = "reference"
+    any_thread = True
 
     def __init__(self) -> None:
         self.renderer = f"NumPy {np.__version__}, double precision"

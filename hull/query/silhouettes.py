@@ -13,9 +13,12 @@ holds all that a bent lens recorded also has pixels that it did not record (`See
 background to a camera that carves, and nothing to one that abstains.
 """
 
+import mmap
+import weakref
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -23,6 +26,8 @@ from numpy.typing import NDArray
 
 from hybridve.calib.pose import Pose, nearest_to_axes, rotation_of, rotation_vector
 from hybridve.hull.query.frame import Frame
+
+_Number = TypeVar("_Number", np.uint8, np.int32)
 
 Unseen = Literal["carve", "keep"]
 
@@ -361,6 +366,8 @@ class Hull:
     integral_offset: NDArray[np.int64]
     recorded_offset: NDArray[np.int64]
     _frame: Frame | None = field(default=None, init=False, repr=False)
+    #: For the images of another hull, until they are there; see `beside`.
+    _room: "list[_Room]" = field(default_factory=list, init=False, repr=False)
 
     @property
     def frame(self) -> Frame:
@@ -430,30 +437,123 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
     ValueError
         If there are not C masks of the cameras' sizes.
     """
+    room = _Room.of(views)
+    hull = _filled(views, masks, room.half(0))
+    hull._room.append(room)
+    return hull
+
+
+def beside(hull: Hull, masks: list[NDArray[np.uint8]]) -> tuple[Hull, Hull]:
+    """Return the hull of other silhouettes of the same views, and the first with both's images.
+
+    The other images lie behind the first's in memory, at offsets of their own and the length of
+    the first's: a hull of some of each is made without copying any.
+
+    Parameters
+    ----------
+    hull : Hull
+        Of one frame. Its images are copied if it was not made by `make_hull`, or the second time.
+    masks : list of C (H, W) uint8
+        As of `make_hull`.
+    """
+    try:
+        room = hull._room.pop()
+    except IndexError:
+        other = make_hull(hull.views, masks)
+        room = _Room(
+            np.concatenate([hull.masks_flat, other.masks_flat]),
+            np.concatenate([hull.answers_flat, other.answers_flat]),
+            np.concatenate([hull.integrals_flat, other.integrals_flat]),
+        )
+    else:
+        other = _filled(hull.views, masks, room.half(1))
+    for whole in (room.masks, room.answers, room.integrals):
+        whole.flags.writeable = False
+    both = replace(
+        hull, masks_flat=room.masks, answers_flat=room.answers, integrals_flat=room.integrals
+    )
+    return other, both
+
+
+#: Pieces of one size, and sizes, of which memory that nobody holds any more is kept.
+_MOST_KEPT, _MOST_SIZES = 2, 6
+
+_kept: dict[int, deque[mmap.mmap]] = {}
+
+
+def _memory(count: int, dtype: type[_Number]) -> NDArray[_Number]:
+    """Return an array (count,) of whatever numbers, to be written to, the first time zeros.
+
+    Its memory is used again once no array holds it. To touch new memory takes the system longer
+    than to fill it with an image: a tenth of a second for a frame of ten cameras.
+    """
+    n_bytes = count * np.dtype(dtype).itemsize
+    try:
+        memory = _kept[n_bytes].pop()
+    except (KeyError, IndexError):
+        memory = mmap.mmap(-1, max(n_bytes, 1))
+    array = np.frombuffer(memory, dtype, count)
+    # Parts of the array hold it, as its memory is not NumPy's own.
+    weakref.finalize(array, _keep, n_bytes, memory).atexit = False
+    return array
+
+
+def _keep(n_bytes: int, memory: mmap.mmap) -> None:
+    """Keep memory that was let go. No lock: this runs wherever the last array happens to go."""
+    if n_bytes not in _kept and len(_kept) >= _MOST_SIZES:
+        _kept.clear()
+    _kept.setdefault(n_bytes, deque(maxlen=_MOST_KEPT)).append(memory)
+
+
+class _Room(NamedTuple):
+    """Memory for the images of two hulls, which costs nothing until it is written to."""
+
+    masks: NDArray[np.uint8]
+    answers: NDArray[np.uint8]
+    integrals: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, views: Views) -> "_Room":
+        n_integrals = int((views.sizes_px + 1).prod(axis=1).sum())
+        if views.seen is not None:
+            n_integrals += len(views.seen.integrals_flat)
+        n_pixels = int(views.sizes_px.prod(axis=1).sum())
+        masks = _memory(2 * n_pixels, np.uint8)
+        answers = masks if views.seen is None else _memory(2 * n_pixels, np.uint8)
+        return cls(masks, answers, _memory(2 * n_integrals, np.int32))
+
+    def half(self, number: int) -> "_Room":
+        """Return the first half, 0, or the second, 1."""
+
+        def part(whole: NDArray[_Number]) -> NDArray[_Number]:
+            return whole[number * (len(whole) // 2) :][: len(whole) // 2]
+
+        masks = part(self.masks)
+        answers = masks if self.answers is self.masks else part(self.answers)
+        return _Room(masks, answers, part(self.integrals))
+
+
+def _filled(views: Views, masks: list[NDArray[np.uint8]], images: _Room) -> Hull:
+    """Return the hull of silhouettes, in memory that is just large enough."""
     if len(masks) != len(views):
         raise ValueError(f"{len(masks)} masks for {len(views)} cameras")
     areas = views.sizes_px.prod(axis=1)
     corners = (views.sizes_px + 1).prod(axis=1)
-    mask_offset = np.concatenate([[0], np.cumsum(areas)[:-1]]).astype(np.int64)
-    integral_offset = np.concatenate([[0], np.cumsum(corners)[:-1]]).astype(np.int64)
     recorded_offset = np.full(len(views), -1, np.int64)
-    masks_flat = np.zeros(int(areas.sum()), np.uint8)
-    n_corners = n_integrals = int(corners.sum())
+    n_corners = int(corners.sum())
     if views.seen is not None:
         has_gaps = views.seen.integral_offset >= 0
         recorded_offset[has_gaps] = n_corners + views.seen.integral_offset[has_gaps]
-        n_integrals += len(views.seen.integrals_flat)
+        images.integrals[n_corners:] = views.seen.integrals_flat
     hull = Hull(
         views,
-        masks_flat,
-        masks_flat if views.seen is None else np.zeros_like(masks_flat),
-        mask_offset,
-        np.zeros(n_integrals, np.int32),
-        integral_offset,
-        recorded_offset,
+        masks_flat=images.masks,
+        answers_flat=images.answers,
+        integrals_flat=images.integrals,
+        mask_offset=np.concatenate([[0], np.cumsum(areas)[:-1]]).astype(np.int64),
+        integral_offset=np.concatenate([[0], np.cumsum(corners)[:-1]]).astype(np.int64),
+        recorded_offset=recorded_offset,
     )
-    if views.seen is not None:
-        hull.integrals_flat[n_corners:] = views.seen.integrals_flat
     for camera, mask in enumerate(masks):
         target = hull.mask(camera)
         if mask.shape != target.shape:
@@ -472,8 +572,8 @@ def make_hull(views: Views, masks: list[NDArray[np.uint8]]) -> Hull:
                 np.multiply(answers, np.uint8(UNSEEN), out=answers)
                 np.add(answers, target, out=answers)
         cv2.integral(target, sum=hull.integral(camera), sdepth=cv2.CV_32S)
-    for images in (hull.masks_flat, hull.answers_flat, hull.integrals_flat):
-        images.flags.writeable = False
+    for flat in (hull.masks_flat, hull.answers_flat, hull.integrals_flat):
+        flat.flags.writeable = False
     return hull
 
 

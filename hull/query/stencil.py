@@ -144,6 +144,7 @@ class Stencil(Closing):
     """
 
     name = "stencil"
+    any_thread = False
 
     def __init__(self, context: moderngl.Context | None = None, window_px: int = WINDOW_PX) -> None:
         self._is_closed = False

@@ -6,6 +6,7 @@ slow down whatever else runs (OpenCV, Open3D); ``tests/benchmarks/bench_thread_p
 
 import itertools
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -15,7 +16,7 @@ _SHARES = 4
 
 
 class Threads:
-    """Threads that work off calls together with the thread that asks.
+    """Threads that work off calls together with the thread that asks; several may ask at once.
 
     Parameters
     ----------
@@ -26,6 +27,7 @@ class Threads:
     def __init__(self, number: int | None = None) -> None:
         self.number = number or usable_cpus()
         self._executor: ThreadPoolExecutor | None = None
+        self._opening = threading.Lock()
 
     @property
     def n_shares(self) -> int:
@@ -43,8 +45,10 @@ class Threads:
                 results[number] = function(*arguments)
 
         n_helpers = min(self.number, len(calls)) - 1
-        if n_helpers > 0 and self._executor is None:
-            self._executor = ThreadPoolExecutor(self.number - 1, "volume-query")
+        if n_helpers > 0:
+            with self._opening:  # several threads may ask at once
+                if self._executor is None:
+                    self._executor = ThreadPoolExecutor(self.number - 1, "volume-query")
         helpers = [
             self._executor.submit(work) for _ in range(n_helpers) if self._executor is not None
         ]
