@@ -85,10 +85,8 @@ def sink(path: Path, *, holds_errors: bool = False) -> Iterator[Sink]:
     with appearing(path) as partial, Sink(partial, holds_errors=holds_errors) as file:
         try:
             yield file
-        except OSError:
-            raise
         except Exception as error:
-            # What else is raised after a write that failed comes of it.
+            # What is raised after a write that failed comes of it; HDF5's errors are OSErrors, too.
             if file.error is None:
                 raise
             raise file.error from error

@@ -82,13 +82,12 @@ def test_polygons_are_cut_where_they_stand_in_the_file(tmp_path: Path) -> None:
     assert faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 4], [0, 1, 2], [0, 2, 3], [0, 3, 4]]
 
 
-@pytest.mark.parametrize("number", ["1000.123456789012", "-0.1", "1e-17", "1.7976931348623157e308"])
+@pytest.mark.parametrize("number", ["1000.123456789012", "-0.1", "1e-17", "9.87654321e17"])
 def test_text_keeps_double_precision(tmp_path: Path, number: str) -> None:
     obj = write(tmp_path / "a.obj", f"v {number} 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     off = write(tmp_path / "a.off", f"OFF\n3 1 0\n{number} 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
 
-    with np.errstate(over="ignore"):  # an area of the largest of all numbers
-        assert corners(obj)[0, 0, 0] == corners(off)[0, 0, 0] == float(number)
+    assert corners(obj)[0, 0, 0] == corners(off)[0, 0, 0] == float(number)
 
 
 def test_objects_of_an_obj_are_parts_and_groups_are_not(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def asked(tmp_path: Path, *options: str, ci: str = "") -> list[str]:
     (tmp_path / "conftest.py").write_text(conftest.read_text(encoding="utf-8"), encoding="utf-8")
     without = [f"-pno:{plugin}" for plugin in ("cacheprovider", "dash", "xdist")]
     environment = {name: value for name, value in os.environ.items() if "XDIST" not in name}
+    environment |= {"PYTHONPATH": str(PROJECT / "tests"), "HYBRIDVE_TESTS": "thorough"}
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-s", *without, "-c", os.devnull, *options, test],
         env={**environment, "CI": ci},

@@ -11,6 +11,7 @@ from helpers.thorough import asked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridve.calib.bounded import has_control
 from hybridve.calib.errors import ReportError
 from hybridve.hull.report.clashes import gather_clashes
 from hybridve.hull.report.ledger import (
@@ -180,8 +181,10 @@ def test_first_ids_are_never_shared_and_always_the_same(
     assert all(name.startswith("a_lid-") for name in named())
 
 
-#: Any text but halves of letters, which no file holds.
-TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
+#: Any text but halves of letters, and what no file may hold and no option takes.
+TEXTS = st.text(st.characters(codec="utf-8"), max_size=20).filter(
+    lambda text: not has_control(text)
+)
 
 entries = st.builds(
     Entry,

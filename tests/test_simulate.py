@@ -198,7 +198,8 @@ def test_the_file_opens_in_vtk_and_its_mesh_moves(
     path = tmp_path / "sim.h5"
     drifting = tmp_path / "scene.toml"
     text = scene.read_text(encoding="utf-8").replace('"cube.obj"', f'"{scene.parent}/cube.obj"')
-    drifting.write_text(text + "drift_m_s = 2.0\n", encoding="utf-8")
+    roots = f'roots = ["{scene.parent}"]\n'
+    drifting.write_text(roots + text + "drift_m_s = 2.0\n", encoding="utf-8")
     assert run("simulate", session, "--scene", drifting, "-o", path, "--frames", ":4") == 0
 
     reader = vtkHDFReader()

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from hybridve.calib.boards.target import Chessboard
 from hybridve.calib.camera import Camera
 from hybridve.calib.errors import CalibrationError
+from hybridve.calib.files import Sink
 from hybridve.calib.judging.certificate import (
     Certificate,
     SeenPoints,
@@ -328,11 +329,13 @@ def test_a_page_cut_off_leaves_nothing(
     with pytest.raises(CalibrationError, match="cannot be written"):
         page_of(tmp_path / "no", two)
 
-    def interrupt(self: Path, *_: object, **__: object) -> None:
-        self.write_bytes(b"half")
+    whole = Sink.write
+
+    def interrupt(self: Sink, data: bytes) -> int:
+        whole(self, data[: len(data) // 2])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Path, "write_text", interrupt)
+    monkeypatch.setattr(Sink, "write", interrupt)
     with pytest.raises(KeyboardInterrupt):
         page_of(tmp_path, two)
     assert list(tmp_path.iterdir()) == []
