@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.agreement import Masks, balls, shifted
 from helpers.hulls import look_at, projection
-from helpers.thorough import asked, some_of
+from helpers.thorough import THOROUGH, asked, some_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -139,7 +139,7 @@ def test_masks_that_are_inverted_are_named(cameras: tuple[int, ...]) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=6)
+@settings(max_examples=6 if THOROUGH else 3)
 @given(st.integers(0, 3), st.floats(-8.0, 8.0).filter(lambda late: abs(late) > 0.5))
 def test_a_late_clock_is_named_to_a_tenth_of_a_frame(camera: int, late: float) -> None:
     delays = tuple(late if number == camera else 0.0 for number in range(4))

@@ -247,6 +247,7 @@ def test_without_the_scene_nobody_tells_how_horsemans_cameras_are_turned(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_camera_of_the_wrong_board_is_named(
     horseman_inputs: Callable[[bool], list[CameraInput]],
 ) -> None:
@@ -325,6 +326,7 @@ def test_a_stereo_pair_in_two_files_is_taken(recordings: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_charuco_rig_misses_by_less_than_its_publisher_accepts(recordings: Path) -> None:
     root = recordings / "pycamset"
     board = Charuco(20, 20, 0.004, 0.0032, "DICT_4X4_1000", legacy=False)

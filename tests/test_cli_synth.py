@@ -86,6 +86,7 @@ def test_the_spacing_reads_back_as_it_was_asked(folder: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_ball_and_the_curtain_are_sessions_with_a_scene(synth: Callable[..., Path]) -> None:
     for preset, names in (
         ("ball", ["ball"]),

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.rooms import see_wall, true_shift_px
-from helpers.thorough import THOROUGH
+from helpers.thorough import THOROUGH, some_of
 from numpy.typing import NDArray
 
 from hybridve.calib.camera import Camera
@@ -369,7 +369,9 @@ def test_every_dataset_of_a_real_report_is_readable(
 @pytest.mark.gl
 @pytest.mark.parametrize(
     ("name", "frame", "cameras"),
-    [("dino_ring", 0, (0, 9, 13)), ("child_rope", 20, (0, 7)), ("horseman", 100, (0, 1, 2, 3))],
+    some_of(
+        [("horseman", 100, (0, 1, 2, 3)), ("dino_ring", 0, (0, 9, 13)), ("child_rope", 20, (0, 7))]
+    ),
 )
 def test_from_a_recorded_cameras_place_one_sees_its_silhouette(
     horseman: Path, name: str, frame: int, cameras: tuple[int, ...]
