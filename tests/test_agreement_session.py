@@ -88,6 +88,7 @@ def kinds(frames: Sequence[Masks], n_cameras: int = 4) -> list[tuple[str, tuple[
     return [(cause.kind, cause.cameras) for cause in found.causes]
 
 
+@pytest.mark.slow
 def test_silhouettes_that_agree_are_not_accused() -> None:
     for n_cameras in (2, 3, 4, 6):
         found = diagnose(trial_of(ring_views(n_cameras), session_of(n_cameras)))
@@ -99,6 +100,7 @@ def test_silhouettes_that_agree_are_not_accused() -> None:
             assert abs(offset.late) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", some_of(range(4)))
 @pytest.mark.parametrize(
     ("kind", "axes"), [("mirrored", (1,)), ("upside down", (0,)), ("turned", (0, 1))]
@@ -199,6 +201,7 @@ def test_where_nobody_moves_no_clock_is_told() -> None:
     assert not any(offset.has_clock for offset in found.offsets)
 
 
+@pytest.mark.slow
 def test_of_two_cameras_a_delay_is_the_other_way_round_as_well() -> None:
     (cause,) = diagnose(trial_of(ring_views(2), session_of(2, (3.0,)))).causes
 
@@ -338,6 +341,7 @@ def judged(frames: Sequence[Masks], first: int = 0, step: int = 1) -> SessionAgr
     return judge_session(views, kept, offset_s={"cam1": 0.5}, fps=25.0)
 
 
+@pytest.mark.slow
 def test_a_session_says_what_to_do() -> None:
     agreement = judged(session_of(4, (0.0, 5.0)), first=100)
 

@@ -30,6 +30,7 @@ def inverted(mesh: Mesh) -> Mesh:
     return mesh[0], np.ascontiguousarray(mesh[1][:, ::-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shells", "winding", "signed_m"),
     [

@@ -210,6 +210,7 @@ def test_another_version_of_the_reader_reads_anew(
     assert len(entries(folder)) == len(before) + 2
 
 
+@pytest.mark.slow
 def test_other_tolerances_and_other_splits_are_other_entries(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "rod.step"
     path.write_text(step_file(step_cylinder, "mm", 50.0, 20.0), encoding="utf-8")

@@ -436,6 +436,7 @@ def test_a_damaged_fbx_is_refused(tmp_path: Path, change: Callable[[str], str], 
 # --- STEP -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("major", "minor", "tolerance_m"), [(50.0, 10.0, 1e-3), (50.0, 10.0, 2e-4), (5.0, 1.0, 1e-3)]
 )

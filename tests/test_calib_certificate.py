@@ -123,6 +123,7 @@ def test_the_warning_says_how_far_points_move() -> None:
     assert "cam2's fx is not determined" in certificate.verdict
 
 
+@pytest.mark.slow
 def test_a_lens_of_which_only_the_middle_was_seen_is_undetermined_and_its_neighbours_are_not() -> (
     None
 ):

@@ -330,6 +330,7 @@ def test_several_bumped_cameras_are_named_with_how_far_they_moved() -> None:
     assert check.moved["cam4"].what == "pose"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("knows_its_errors", [True, False])
 @pytest.mark.parametrize("pair", [("cam1", "cam2"), ("cam1", "cam3"), ("cam3", "cam4")])
 def test_exchanged_cameras_are_named(pair: tuple[str, str], knows_its_errors: bool) -> None:

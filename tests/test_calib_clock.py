@@ -80,6 +80,7 @@ def estimate(recording: Recording) -> Clocks:
     return estimate_offsets(recording.boards, recording.cameras, recording.observations)
 
 
+@pytest.mark.slow
 def test_offsets_are_found_to_a_fraction_of_a_frame() -> None:
     clocks = estimate(out_of_time(LATE))
 
@@ -130,6 +131,7 @@ def with_jumps(recording: Recording, share: float, missing: float, seed: int) ->
     return replace(recording, observations=observations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "seed"), [(0.03, 100), (0.1, 101)])
 def test_views_that_jump_are_left_out(share: float, seed: int) -> None:
     recording = with_jumps(out_of_time(LATE, noise_px=0.2, seed=seed), share, 0.1, seed)
@@ -153,6 +155,7 @@ def test_views_that_jump_are_left_out(share: float, seed: int) -> None:
         assert np.max(misses) < 0.5
 
 
+@pytest.mark.slow
 def test_the_views_that_jump_are_told() -> None:
     recording = out_of_time({"cam1": 0.0, "cam2": 0.5})
     seen = recording.observations[1]
@@ -193,6 +196,7 @@ def test_a_board_that_is_shaken_is_no_view_that_jumps() -> None:
     assert len(moved[1].sightings) == len(seen[1].sightings) - 3
 
 
+@pytest.mark.slow
 def test_a_symmetric_board_tells_them_too() -> None:
     clocks = estimate(out_of_time(LATE, board=SYMMETRIC))
 
@@ -213,6 +217,7 @@ def test_the_order_of_cameras_changes_no_bit() -> None:
         np.testing.assert_array_equal(turned.rig[camera.name].cam_from_world, camera.cam_from_world)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_px", [0.0, 0.2])
 def test_a_board_that_does_not_move_tells_nothing(noise_px: float) -> None:
     clocks = estimate(out_of_time(LATE, amount=0.0, noise_px=noise_px))

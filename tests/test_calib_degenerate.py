@@ -326,6 +326,7 @@ def test_a_recording_that_contradicts_itself_gives_a_rig_that_is_doubted(case: s
     assert_doubted(named, calibrated([LYING], make())[1])
 
 
+@pytest.mark.slow
 def test_a_symmetric_board_that_nothing_turns_is_doubted() -> None:
     cameras = ring(SYMMETRIC, ["SIMPLE_RADIAL"] * 2)
 
@@ -334,6 +335,7 @@ def test_a_symmetric_board_that_nothing_turns_is_doubted() -> None:
     assert_doubted("looks the same when turned|odd sum of columns and rows", certificate)
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_not_the_cameras_is_refused() -> None:
     params = (300.0, 320.0, 240.0, 0.0)
 
@@ -362,6 +364,7 @@ def assert_honest(
     assert worst_sigmas(calibration, certificate, true) < _CONFIDENTLY_WRONG
 
 
+@pytest.mark.slow
 def test_a_camera_upside_down_is_as_good_as_any() -> None:
     cameras = around()
     x, y, _ = LYING.center_board
@@ -388,6 +391,7 @@ def test_one_camera_alone_is_placed_and_no_error_in_mm_is_stated() -> None:
     assert any("one camera alone" in warning for warning in certificate.warnings)
 
 
+@pytest.mark.slow
 def test_three_views_make_a_lens_that_is_as_unsure_as_it_says() -> None:
     calibration, certificate = calibrated(
         [LYING], with_stills(lying(), 1, pictures(board_poses(LYING, 3, 5)))
@@ -398,6 +402,7 @@ def test_three_views_make_a_lens_that_is_as_unsure_as_it_says() -> None:
     assert two.place_std_m > 1.2 * one.place_std_m
 
 
+@pytest.mark.slow
 def test_a_board_in_a_corner_of_the_image_leaves_the_rest_unsure() -> None:
     camera = around()[1]
     poses = []
@@ -420,6 +425,7 @@ def test_a_board_in_a_corner_of_the_image_leaves_the_rest_unsure() -> None:
     assert "% of the image" in told
 
 
+@pytest.mark.slow
 def test_boards_half_hidden_everywhere_give_a_rig_that_is_as_unsure_as_it_says() -> None:
     rng = np.random.default_rng(1)
     hidden = [
@@ -510,6 +516,7 @@ def test_of_two_cameras_the_mirrored_one_cannot_be_told() -> None:
     assert_refused("'cam2' or of 'cam1' seems to be mirrored", [CARRIED], [one, mirrored(other)])
 
 
+@pytest.mark.slow
 def test_a_mirrored_board_of_markers_on_the_floor_puts_its_camera_below() -> None:
     seen = lying()
     seen[1] = mirrored(seen[1], are_points_named=True)
@@ -517,6 +524,7 @@ def test_a_mirrored_board_of_markers_on_the_floor_puts_its_camera_below() -> Non
     assert_refused("'cam2' .*came out under the floor: is its picture mirrored", [LYING], seen)
 
 
+@pytest.mark.slow
 def test_a_camera_that_saw_another_board_is_doubted() -> None:
     camera = row_of_cameras(3, 0.25, "SIMPLE_PINHOLE")[1]
     seen = [replace(one, sightings=one.sightings[:6]) for one in carried()]
@@ -550,6 +558,7 @@ def test_the_same_sightings_twice_count_once() -> None:
         assert off_m < 0.01
 
 
+@pytest.mark.slow
 def test_groups_that_never_meet_are_named_with_the_nearest_edge() -> None:
     near = row_of_cameras(2, 0.25, "SIMPLE_PINHOLE")
     away = [
@@ -614,6 +623,7 @@ def test_boards_back_to_back_link_cameras_that_face_each_other() -> None:
     assert_honest(calibration, certificate, true)
 
 
+@pytest.mark.slow
 def test_the_order_of_boards_and_cameras_changes_no_bit() -> None:
     boards, seen, _, _ = facing()
     swapped = [
@@ -669,6 +679,7 @@ def late_by(frames_late: float) -> list[Observations]:
     return observations
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_late_contradicts_the_others_and_the_way_out_is_said() -> None:
     assert_refused(
         r"'cam2' contradicts 'cam1', 'cam3'.*sync = \"estimate\" if some are late",

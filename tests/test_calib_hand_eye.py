@@ -351,6 +351,7 @@ def test_a_tracker_in_another_unit_is_refused_and_the_unit_named(factor: float, 
     assert said in refused(walk, tracked=tracked)
 
 
+@pytest.mark.slow
 def test_inverted_poses_and_those_of_other_instants_are_refused() -> None:
     walk = Walk(0, noise_px=0.3)
     inverted = {k: invert(pose) for k, pose in walk.tracked.items()}

@@ -162,6 +162,7 @@ def test_where_nothing_is_around_the_board_nobody_is_accused(name: str) -> None:
     assert evidence.is_weak is {"7x6": None, "8x6": True}[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigmas", [(1.0, 9.0), (9.0, 1.0)])
 def test_of_two_boards_the_one_that_is_told_worse_is_doubted(
     monkeypatch: pytest.MonkeyPatch, sigmas: tuple[float, float]

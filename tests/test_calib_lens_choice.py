@@ -40,6 +40,7 @@ def observe(camera: Camera, views: list[NDArray[np.float64]]) -> Observations:
     return Observations(camera.name, "auto", SIZE_PX, sightings, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "noise_px"), some_of((m, (0.1, 0.3)[i % 2]) for i, m in enumerate(CANDIDATES))
 )
@@ -58,6 +59,7 @@ def test_the_true_model_is_found_or_a_simpler_one_that_predicts_as_well(
     assert chosen.rms_px**2 <= true.rms_px**2 * (1.0 + (10.0 + 8.0 * saved) / (2 * 10 * 42))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "OPENCV"])
 def test_models_that_differ_beyond_the_noise_are_told_apart(model: str) -> None:
     chosen = choose_lens([BOARD], noisy(make_camera("cam", model, np.eye(3, 4)), 12, 0.1, 2))
@@ -94,6 +96,7 @@ def test_a_wide_fisheye_is_recognised() -> None:
     assert "PINHOLE" not in chosen.choice.candidates  # straight lines end long before
 
 
+@pytest.mark.slow
 def test_the_choice_can_be_stored_and_says_what_is_told_apart() -> None:
     chosen = choose_lens([BOARD], noisy(make_camera("cam", "OPENCV", np.eye(3, 4)), 25, 0.1))
 
@@ -135,6 +138,7 @@ def test_the_choice_does_not_depend_on_the_order_of_sightings() -> None:
     np.testing.assert_array_equal(first.camera.params, turned.camera.params)
 
 
+@pytest.mark.slow
 def test_cameras_that_share_a_lens_choose_together() -> None:
     camera = make_camera("a", "OPENCV", np.eye(3, 4))
     seen = [noisy(camera, 12, 0.1, 1), noisy(replace(camera, name="b"), 12, 0.1, 2)]
@@ -146,6 +150,7 @@ def test_cameras_that_share_a_lens_choose_together() -> None:
     np.testing.assert_array_equal(first.camera.params, second.camera.params)
 
 
+@pytest.mark.slow
 def test_parallel_boards_choose_nothing() -> None:
     camera = make_camera("cam", "OPENCV", np.eye(3, 4))
     rng = np.random.default_rng(4)

@@ -203,6 +203,7 @@ def test_stills_and_a_still_clip_are_told_apart(recorded: Path) -> None:
         }
 
 
+@pytest.mark.slow
 def test_somebody_who_crosses_the_clip_leaves_no_trace(recorded: Path) -> None:
     (seen, _) = observe_boards([BOARD], inputs(recorded), SETTINGS)
 
@@ -253,6 +254,7 @@ def test_moving_boards_are_seen_frame_by_frame_and_may_be_missing(recorded: Path
             assert np.abs(sighting.pixels - project(camera, pose, BOARD)).max() < FOUND_PX
 
 
+@pytest.mark.slow
 def test_a_board_that_moves_for_one_camera_moves_for_all(recorded: Path) -> None:
     left, right = inputs(recorded)[0], moving_inputs(recorded)[1]
 
@@ -263,6 +265,7 @@ def test_a_board_that_moves_for_one_camera_moves_for_all(recorded: Path) -> None
     assert [s.instant for s in moving.sightings] == [0, 2, 3]
 
 
+@pytest.mark.slow
 def test_a_board_that_is_nudged_does_not_lie_still(recorded: Path, tmp_path: Path) -> None:
     for camera in two_cameras():
         nudge = np.column_stack([np.eye(3), [0.02, 0.0, 0.0]])
@@ -301,6 +304,7 @@ def test_clips_without_stills_serve_and_checking_needs_no_stills(recorded: Path)
         assert np.abs(sighting.pixels - expected).max() < FOUND_PX
 
 
+@pytest.mark.slow
 def test_parts_of_boards_and_what_is_unusual_are_told(recorded: Path) -> None:
     whole = observe_boards([BOARD], inputs(recorded), SETTINGS)
     parts = observe_boards([Partial(7, 6, 0.1)], inputs(recorded), SETTINGS)
@@ -357,6 +361,7 @@ def test_each_picture_may_show_any_of_the_boards(two_boards: Path) -> None:
     assert pixels["0.png", 0][:, 0].max() < 180 < pixels["0.png", 1][:, 0].min()
 
 
+@pytest.mark.slow
 def test_a_part_of_a_larger_board_is_not_a_smaller_one(recorded: Path) -> None:
     class Part(Chessboard):
         def detect(self, image: NDArray[Any], effort: Effort = "thorough") -> Detection:
@@ -403,6 +408,7 @@ def test_progress_counts_up_to_its_total(recorded: Path, kept: Path) -> None:
         }
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_does_not_matter(recorded: Path) -> None:
     cameras = inputs(recorded)
 
@@ -453,6 +459,7 @@ def moving_film_inputs(root: Path) -> list[CameraInput]:
     return [replace(c, intrinsics=None, extrinsics=c.intrinsics) for c in film_inputs(root)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make", [inputs, moving_inputs, film_inputs, moving_film_inputs], ids=lambda make: make.__name__
 )
@@ -509,6 +516,7 @@ def test_only_a_picture_that_changed_is_searched_again(
     assert np.abs(pixels["3.png", 0] - expected).max() < FOUND_PX
 
 
+@pytest.mark.slow
 def test_another_board_is_looked_for_anew(recorded: Path, kept: Path) -> None:
     cameras = inputs(recorded)[:1]
     first = observe_boards([BOARD], cameras, SETTINGS, None, CornerCache(kept))
@@ -661,6 +669,7 @@ def test_corners_are_given_for_frames_of_videos(filmed: Path, tmp_path: Path) ->
         np.testing.assert_allclose(found[image, 0], given, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_given_corners_name_their_board(two_boards: Path, tmp_path: Path) -> None:
     given = np.arange(40.0).reshape(20, 2)
     path = write_csv(
@@ -764,6 +773,7 @@ def test_a_camera_that_sees_no_board_is_named_with_what_was_tried(
         observe_boards([BOARD], [left, inputs(recorded)[1]], SETTINGS)
 
 
+@pytest.mark.slow
 def test_a_camera_that_never_sees_the_moving_board_is_named(recorded: Path, tmp_path: Path) -> None:
     write_images(tmp_path / "clip", [bare()] * 4)
     left, right = moving_inputs(recorded)

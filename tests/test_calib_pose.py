@@ -34,6 +34,7 @@ def rodrigues(vectors: NDArray[np.float64]) -> NDArray[np.longdouble]:
     return np.asarray(result, np.longdouble)
 
 
+@pytest.mark.slow
 def test_rotations_are_exact_at_every_angle_and_orthogonal_to_rounding() -> None:
     some = vectors()
 
@@ -94,6 +95,7 @@ def test_a_pose_moves_in_the_frame_it_leads_to_or_turns_about_its_own_origin() -
     np.testing.assert_array_equal(moved_pose(poses[3], changes[3]), moved[3])
 
 
+@pytest.mark.slow
 def test_a_pose_that_is_moved_ten_thousand_times_is_still_a_pose() -> None:
     rng = np.random.default_rng(3)
     pose = np.eye(3, 4)

@@ -74,6 +74,7 @@ def opinion_of(rig: Rig, other: Rig) -> SecondOpinion:
     return told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("clip_px", "stills_px"), KINDS)
 def test_sound_rigs_are_not_doubted(clip_px: float, stills_px: float) -> None:
     """Not even where kinds of views differ fifty times in noise, of which COLMAP knows nothing."""
@@ -139,6 +140,7 @@ def test_a_wrong_weight_is_told(seed: int) -> None:
     assert told.disagrees
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("clip_px", "stills_px"), KINDS)
 def test_a_camera_that_was_nudged_by_more_than_its_error_is_told(
     clip_px: float, stills_px: float
@@ -213,6 +215,7 @@ def test_without_an_answer_or_a_common_volume_there_is_no_opinion() -> None:
 # --- Whole calibrations -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_calibration_has_an_opinion_that_agrees(moves: bool, seed: int) -> None:
@@ -227,6 +230,7 @@ def test_a_calibration_has_an_opinion_that_agrees(moves: bool, seed: int) -> Non
     assert record.second_opinion.difference95_m < record.second_opinion.expected95_m / 3.0
 
 
+@pytest.mark.slow
 def test_a_camera_nudged_after_colmaps_adjustment_is_a_doubt(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -246,6 +250,7 @@ def test_a_camera_nudged_after_colmaps_adjustment_is_a_doubt(
     assert doubt.startswith("COLMAP's own adjustment")
 
 
+@pytest.mark.slow
 def test_a_clip_that_is_given_a_wrong_weight_is_a_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     measured = measure_group_noise
 
@@ -261,6 +266,7 @@ def test_a_clip_that_is_given_a_wrong_weight_is_a_doubt(monkeypatch: pytest.Monk
     assert doubt.startswith("COLMAP's own adjustment")
 
 
+@pytest.mark.slow
 def test_without_colmaps_answer_the_rig_is_the_same_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -100,6 +100,7 @@ def test_the_same_corners_give_the_same_rig_to_the_bit() -> None:
     assert first.provenance == second.provenance
 
 
+@pytest.mark.slow
 def test_the_error_that_is_told_is_the_noise_that_was_there() -> None:
     noise_px = 0.2
     cameras = ring(BOARD, ["OPENCV", "OPENCV"])
@@ -273,6 +274,7 @@ def side_by_side(model: str) -> list[Camera]:
     ]
 
 
+@pytest.mark.slow
 def test_a_moving_board_ties_cameras_together() -> None:
     cameras = side_by_side("OPENCV")
     observations, world_from_board = moving(BOARD, cameras)
@@ -287,6 +289,7 @@ def test_a_moving_board_ties_cameras_together() -> None:
     assert_same_rig(rig, expected)
 
 
+@pytest.mark.slow
 def test_frames_tell_which_way_round_a_symmetric_board_was_seen() -> None:
     board = Chessboard(8, 6, 0.1)
     cameras = side_by_side("PINHOLE")

@@ -70,6 +70,7 @@ def test_a_board_that_hardly_moved_tells_nothing() -> None:
         assert state(check) == "open"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second", [Chessboard(7, 6, 0.05), Chessboard(9, 5, 0.05)], ids=str)
 def test_a_second_board_tells_whether_it_is_symmetric_or_not(second: Chessboard) -> None:
     boards = [SYMMETRIC, second]

@@ -188,6 +188,7 @@ SAID_OF_CHARUCO: list[tuple[Board, str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("said", "told"), SAID_OF_CHARUCO)
 def test_a_charuco_board_is_named_for_what_it_is(
     charuco: NDArray[np.uint8], said: Board, told: str
@@ -210,6 +211,7 @@ def test_a_grid_of_tags_that_goes_on_is_not_the_one_described(
     assert said.detect(april, "quick").corners is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "is_told"), [(8, True), (6, False)])
 def test_rows_that_were_in_view_and_never_seen_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, rows: int, is_told: bool

@@ -218,6 +218,7 @@ def test_a_rig_is_asked_again_when_the_clip_the_board_or_the_rig_changes(
     assert not is_asked()
 
 
+@pytest.mark.slow
 def test_where_no_clip_shows_the_board_that_is_said_and_the_rig_used(
     session: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -232,6 +233,7 @@ def test_where_no_clip_shows_the_board_that_is_said_and_the_rig_used(
     assert "no board of 7x6 inner corners" in record.getMessage()
 
 
+@pytest.mark.slow
 def test_one_clip_without_a_board_does_not_hide_what_the_others_show(
     session: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -349,6 +351,7 @@ def test_a_camera_turned_about_a_board_that_looks_the_same_then_is_refused(sessi
         load(session)
 
 
+@pytest.mark.slow
 def test_where_nothing_tells_how_cameras_are_turned_that_is_said_each_time(
     session: Path,
     run: Callable[..., int],

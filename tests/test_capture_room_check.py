@@ -80,6 +80,7 @@ def session(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_camera_that_moved_is_told_in_one_line_and_the_other_is_not(
     session: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -106,6 +107,7 @@ def test_a_camera_that_moved_is_told_in_one_line_and_the_other_is_not(
     assert "expected less than 1); calibrate again" in check.messages[0]
 
 
+@pytest.mark.slow
 def test_what_was_found_is_kept_until_a_picture_changes(
     session: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -134,6 +136,7 @@ def test_what_was_found_is_kept_until_a_picture_changes(
     assert put_back.moved == ()
 
 
+@pytest.mark.slow
 def test_another_lens_is_asked_anew(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded, other = load_session(session), rig()
     first = check_room(loaded, other)
@@ -157,6 +160,7 @@ def test_cameras_without_both_pictures_and_where_no_test_is_wanted_are_not_asked
     assert check_room(load_session(session), rig()) == RoomCheck()
 
 
+@pytest.mark.slow
 def test_a_blank_wall_tells_nothing_and_is_no_warning(
     session: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -191,6 +195,7 @@ def test_pictures_of_another_size_or_that_cannot_be_read_are_said_to_tell_nothin
     assert "0.png" in check.cameras["cam2"].message
 
 
+@pytest.mark.slow
 def test_a_board_that_was_carried_is_not_taken_for_the_room(session: Path) -> None:
     text = session.read_text(encoding="utf-8")
     target = (
@@ -214,12 +219,14 @@ def test_a_board_that_was_carried_is_not_taken_for_the_room(session: Path) -> No
     assert check.cameras["cam1"].n_found < 12
 
 
+@pytest.mark.slow
 def test_a_check_goes_through_json_whole(session: Path) -> None:
     check = check_room(load_session(session), rig())
 
     assert read_strictly(RoomCheck, to_plain(check), "room") == check
 
 
+@pytest.mark.slow
 def test_whatever_is_evaluated_knows_of_it(session: Path) -> None:
     scene = write_cube_scene(session.parent / "scene", {"cube": (0.0, 0.0, 0.0)})
 

@@ -74,6 +74,7 @@ def test_what_is_laid_over_much_of_the_picture_leaves_it_open(width_px: int, mes
     assert message in found.message
 
 
+@pytest.mark.slow
 def test_one_thing_that_was_carried_is_not_taken_for_the_room() -> None:
     then, now = (np.full((240, 320), 128.0, np.float32) for _ in range(2))
     then[40:160, 40:160] = wall(1)[:120, :120]
@@ -86,6 +87,7 @@ def test_one_thing_that_was_carried_is_not_taken_for_the_room() -> None:
     assert "features are shifted by" in found.message
 
 
+@pytest.mark.slow
 def test_what_is_masked_is_not_asked() -> None:
     then = exposed(see_wall(LENS, wall(0), NONE), np.random.default_rng(0))
     nothing = np.zeros(then.shape, np.uint8)

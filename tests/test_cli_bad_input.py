@@ -205,6 +205,7 @@ def test_stills_of_which_some_were_turned_when_they_were_saved_are_refused(
     assert len(lines) == 2
 
 
+@pytest.mark.slow
 def test_the_session_of_these_tests_is_good(run: Run, films: Path) -> None:
     assert run(*detect_arguments(films)) == 0
     assert run("segment", films, "--no-progress") == 0
@@ -334,6 +335,7 @@ def test_stored_silhouettes_that_are_damaged(
     expect_one_line(run, capsys, "hybridve segment --overwrite", *detect_arguments(films))
 
 
+@pytest.mark.slow
 def test_stored_silhouettes_serve_until_the_recording_changes(run: Run, films: Path) -> None:
     from hybridve.hull.report.read import read_report
 

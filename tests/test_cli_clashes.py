@@ -152,6 +152,7 @@ def test_reports_in_a_folder_share_its_ledger_if_there_is_one(
     assert names == ["clashes.toml", "p2.h5", "r.h5"]
 
 
+@pytest.mark.slow
 def test_what_no_longer_clashes_is_told_and_what_was_never_found_too(
     run: Run, report: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -289,6 +290,7 @@ def test_of_the_same_silhouettes_a_tenth_of_a_millimetre_counts(
     assert "the same silhouettes, so that only bounds count" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_clash_that_broke_in_two_has_not_appeared(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

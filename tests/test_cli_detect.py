@@ -117,6 +117,7 @@ def test_a_finer_accuracy_takes_smaller_steps_and_says_so(
     assert about["largest_viewport"] == 58
 
 
+@pytest.mark.slow
 def test_a_range_of_frames_keeps_their_numbers(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -129,6 +130,7 @@ def test_a_range_of_frames_keeps_their_numbers(
     np.testing.assert_allclose(report.time_s, np.array([2, 6, 10]) / 25)
 
 
+@pytest.mark.slow
 def test_a_damaged_picture_is_a_row_with_a_reason(run: Run, tmp_path: Path, scene: Path) -> None:
     session = write_ball_session(tmp_path / "session", CENTERS[5:8])
     (tmp_path / "session" / "cam2" / "1.png").write_bytes(b"torn")
@@ -167,6 +169,7 @@ def test_a_late_camera_is_read_in_step_with_the_others(
     assert report.objects["hit"].n_points.sum() > 0
 
 
+@pytest.mark.slow
 def test_a_camera_that_stops_early_is_told_frame_by_frame(
     run: Run, tmp_path: Path, scene: Path
 ) -> None:
@@ -196,6 +199,7 @@ def test_status_3_tells_of_a_clash_only_if_asked(
     assert run(*clash, "-o", tmp_path / "d.h5", "--fail-on-clash", "--let-pass", "clash") == 0
 
 
+@pytest.mark.slow
 def test_a_frame_that_could_not_be_read_is_no_kept_distance(
     run: Run, tmp_path: Path, scene: Path
 ) -> None:
@@ -288,6 +292,7 @@ def test_a_missing_rig_is_told_with_the_command_that_makes_one(
     assert "run `hybridve calibrate" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_masks_of_another_size_than_the_others_are_a_row_with_a_reason(
     run: Run, tmp_path: Path, scene: Path
 ) -> None:
@@ -319,6 +324,7 @@ def test_wrong_usage_is_status_2(run: Run, arguments: list[str]) -> None:
     assert run(*arguments) == 2
 
 
+@pytest.mark.slow
 def test_options_of_contact_are_kept_and_options_left_out_leave_columns_out(
     run: Run, tmp_path: Path, session: Path, scene: Path
 ) -> None:
@@ -345,6 +351,7 @@ def test_options_of_contact_are_kept_and_options_left_out_leave_columns_out(
     assert (width_m <= 0.001 + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_json_of_detect_is_that_of_summary(
     run: Run, tmp_path: Path, session: Path, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -459,6 +466,7 @@ def test_what_the_samples_miss_is_certified_told_and_fails_on_clash(
     assert (sampled.certificate[missed] == "").all()
 
 
+@pytest.mark.slow
 def test_whoever_leaves_a_recording_early_leaves_no_thread_behind(tmp_path: Path) -> None:
     """A thread that is inside a library when Python ends would take the process down."""
     session = load_session(write_ball_session(tmp_path / "session", np.tile(CENTERS, (10, 1))))

@@ -150,6 +150,7 @@ def blocks_of(reader: vtkHDFReader, time_s: float) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_vtk_shows_cad_points_nearest_ways_and_the_hull_in_every_frame(
     run: Run, ball: Path, tmp_path: Path
 ) -> None:
@@ -199,6 +200,7 @@ def test_without_the_session_vtk_shows_all_but_the_hull(
     assert len(blocks_of(reader, 0.0)) == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ply", "glb"])
 def test_trimesh_reads_a_closed_hull_of_each_frame(
     run: Run, ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str

@@ -44,6 +44,7 @@ def spoil(session: Path, camera: str, frame: int, shift_px: int) -> None:
 # --- Frames to look at --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sound_silhouettes_have_nothing_to_look_at(
     run: Run, session: Path, capsys: Captured
 ) -> None:
@@ -56,6 +57,7 @@ def test_sound_silhouettes_have_nothing_to_look_at(
     assert "the cameras support each other" in page
 
 
+@pytest.mark.slow
 def test_the_frame_of_a_silhouette_beside_its_thing_is_the_first_to_look_at(
     run: Run, session: Path, capsys: Captured
 ) -> None:
@@ -130,6 +132,7 @@ def test_a_person_who_comes_in_slowly_is_no_jump() -> None:
 # --- Page and film ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_a_page_an_older_one_goes(run: Run, session: Path) -> None:
     assert run("segment", session) == 0
     assert run("segment", session, "--overwrite", "--no-page") == 0
@@ -137,6 +140,7 @@ def test_without_a_page_an_older_one_goes(run: Run, session: Path) -> None:
     assert not (session.parent / "silhouettes.html").exists()
 
 
+@pytest.mark.slow
 def test_a_name_of_markup_stands_as_text(run: Run, tmp_path: Path) -> None:
     session = write_ball_session(tmp_path / "<script>x", CENTERS[:3])
 
@@ -147,6 +151,7 @@ def test_a_name_of_markup_stands_as_text(run: Run, tmp_path: Path) -> None:
     assert "<script>x" not in page
 
 
+@pytest.mark.slow
 def test_the_film_has_every_frame(run: Run, session: Path, tmp_path: Path) -> None:
     import av
 
@@ -196,6 +201,7 @@ def test_scores_are_those_of_overlapping_squares() -> None:
     assert (nothing.iou, nothing.f1) == (1.0, 1.0)
 
 
+@pytest.mark.slow
 def test_silhouettes_are_scored_by_camera_and_frame(
     run: Run, session: Path, tmp_path: Path, capsys: Captured
 ) -> None:
@@ -249,6 +255,7 @@ def test_masks_that_are_not_there_are_told_before_the_work(
     assert not (session.parent / "silhouettes.h5").exists()
 
 
+@pytest.mark.slow
 def test_a_hand_mask_of_another_size_is_told(
     run: Run, session: Path, tmp_path: Path, capsys: Captured
 ) -> None:

@@ -55,6 +55,7 @@ def test_sessions_are_columns_and_who_reaches_farther_needs_more(
     assert lines[-1].startswith("not moved, and violated all the same: post in ")
 
 
+@pytest.mark.slow
 def test_silhouettes_are_grown_on_demand_and_that_is_said(
     run: Run, task: list[object], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,6 +123,7 @@ def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     assert sorted(tmp_path.iterdir()) == [output, picture]
 
 
+@pytest.mark.slow
 def test_a_larger_clearance_needs_as_much_more(
     run: Run, task: list[object], capsys: pytest.CaptureFixture[str]
 ) -> None:

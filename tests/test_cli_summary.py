@@ -325,6 +325,7 @@ def test_the_answer_comes_first_who_how_surely_and_where_to_look(
     assert first_line(run, capsys, frames, path, required_m=required_m) == line
 
 
+@pytest.mark.slow
 def test_the_picture_shows_each_object_in_its_colours(
     run: Run, tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

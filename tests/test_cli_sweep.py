@@ -42,6 +42,7 @@ def quick(session: Path, scene: Path, tmp_path: Path) -> list[object]:
     ]
 
 
+@pytest.mark.slow
 def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     run: Run, tmp_path: Path, quick: list[object], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -74,6 +75,7 @@ def test_json_says_what_the_file_holds_and_the_picture_is_drawn(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["sweep.h5", "sweep.png"]
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_for_every_engine_and_viewport(
     run: Run, quick: list[object], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -89,6 +91,7 @@ def test_the_table_has_a_line_for_every_engine_and_viewport(
     assert any("triangles asked collide" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_an_accuracy_gives_each_triangle_its_viewport(
     run: Run, tmp_path: Path, quick: list[object]
 ) -> None:
@@ -101,6 +104,7 @@ def test_an_accuracy_gives_each_triangle_its_viewport(
     assert rows.viewport[-1] == 0
 
 
+@pytest.mark.slow
 def test_by_default_the_accuracy_is_that_of_the_middle_viewport(
     run: Run, tmp_path: Path, quick: list[object]
 ) -> None:
@@ -111,6 +115,7 @@ def test_by_default_the_accuracy_is_that_of_the_middle_viewport(
     assert rows.viewport_most[-1] in (4, 5)  # the quotient may round up
 
 
+@pytest.mark.slow
 def test_by_default_few_frames_are_taken_from_the_whole_recording(
     run: Run, tmp_path: Path, quick: list[object]
 ) -> None:
@@ -124,6 +129,7 @@ def test_by_default_few_frames_are_taken_from_the_whole_recording(
     assert index[-1] >= N_FRAMES - 3
 
 
+@pytest.mark.slow
 def test_nothing_collides_is_told_and_times_are_given(
     run: Run, tmp_path: Path, quick: list[object], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,6 +146,7 @@ def test_nothing_collides_is_told_and_times_are_given(
     assert run(*quick, "--frames", "0:2", "--overwrite") == 0
 
 
+@pytest.mark.slow
 def test_engines_that_do_not_open_are_left_out_unless_they_were_named(
     run: Run,
     tmp_path: Path,
@@ -193,6 +200,7 @@ def test_the_reference_is_left_out_where_it_would_take_long(
     assert names == ["native", "reference"]
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 def test_engines_that_draw_take_turns_and_agree(
     run: Run, tmp_path: Path, quick: list[object]

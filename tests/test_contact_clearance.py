@@ -237,6 +237,7 @@ def test_the_side_of_a_closed_surface() -> None:
     assert (distance < 0).sum() > 1000
 
 
+@pytest.mark.slow
 def test_a_lattice_computes_a_distance_once() -> None:
     """Corners are shared by neighbours, by levels and by frames."""
     lattice = DistanceLattice(SurfaceDistance(*sheet(0.5, 0.0), is_closed=False), 4.0)
@@ -298,6 +299,7 @@ def test_bounds_of_cells_hold_at_every_point_of_them(is_closed: bool) -> None:
     assert sides == ({-1, 0, 1} if is_closed else {1})
 
 
+@pytest.mark.slow
 def test_forgetting_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     views = ring_views()
     hulls: list[Hull] = [
@@ -311,6 +313,7 @@ def test_forgetting_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [forgetting.measure(hull).signed_m for hull in hulls] == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("voxel_m", [0.01, 0.005])
 def test_a_peer_agrees_to_the_resolution_of_its_mesh(voxel_m: float) -> None:
     """python-fcl between the CAD and a surface of the same hull by marching cubes.

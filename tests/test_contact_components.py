@@ -60,6 +60,7 @@ def volume_at(volumes: Volumes, point: NDArray[np.float64]) -> int:
     return int(volumes.at(point[None])[0])
 
 
+@pytest.mark.slow
 def test_rays_of_different_balls_cross_in_a_phantom_that_is_unsure_and_the_balls_are_real() -> None:
     # The first camera sees the phantom before ball B, the second before A, the third behind A.
     phantom = crossing(FIRST, BALL_B, SECOND, BALL_A)
@@ -75,6 +76,7 @@ def test_rays_of_different_balls_cross_in_a_phantom_that_is_unsure_and_the_balls
     assert [real[of_a], real[of_b], real[of_phantom]] == [True, True, False]
 
 
+@pytest.mark.slow
 def test_a_phantom_on_a_neck_is_one_volume_with_what_is_real_and_no_more_is_said() -> None:
     phantom = crossing(FIRST, BALL_B, SECOND, BALL_A)
     third = phantom + (BALL_A - phantom) * 3.0 / np.linalg.norm(BALL_A - phantom)

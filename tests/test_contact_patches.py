@@ -18,6 +18,7 @@ CENTERS = np.array([[-0.3, 0.0, 0.0], [0.3, 0.05, 0.0]])
 RADII_M = (0.06, 0.05)
 
 
+@pytest.mark.slow
 def test_two_balls_that_touch_one_plate_are_two_patches() -> None:
     hull, part = balls(looking_down(), RADII_M, CENTERS), plate(0.03)
     meter, contact = found_in(hull, part)
@@ -41,6 +42,7 @@ def test_two_balls_that_touch_one_plate_are_two_patches() -> None:
     assert any((patch.cp_obj_world == cp_obj).all() for patch in patches)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("required_m", "count"), [(0.1, 2), (0.05, 1), (0.02, 0)])
 def test_what_is_nearer_than_required_is_a_patch_with_bounds_of_its_own(
     required_m: float, count: int
@@ -137,6 +139,7 @@ def test_a_plate_is_free_once_it_is_moved_above_the_hull() -> None:
     assert recover(hull, meter, UP, np.nan, 2.0).frees == ""
 
 
+@pytest.mark.slow
 def test_a_point_that_is_out_does_not_mean_that_the_object_is() -> None:
     """D_rec frees CP_obj; the other ball still holds the plate."""
     raised = CENTERS + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.02]])

@@ -68,6 +68,7 @@ def test_at_the_shift_a_report_would_say_that_the_clearance_is_at_least_what_is_
     assert at_least_m(below_m) < task.required_m
 
 
+@pytest.mark.slow
 def test_a_wall_that_moves_away_at_a_slant_must_go_as_much_farther(task: ErringTask) -> None:
     views, center = views_of(task.cameras), task.centers_world[0]
     hull = ball_hull(views, center, task.radius_m)

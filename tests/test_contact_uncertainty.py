@@ -62,6 +62,7 @@ def touching(point: NDArray[np.float64]) -> Contact:
     return replace(FREE, certificate="colliding", witness_world=point)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n_cameras", "toward"),
     [(4, (1.0, 0.2, 0.1)), (5, (0.6, 0.3, 1.0)), (3, (0.3, -1.0, 0.5)), (6, (-0.5, 0.6, -0.2))],

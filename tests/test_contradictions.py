@@ -160,6 +160,7 @@ def test_cameras_with_nothing_in_common_are_refused(
     assert not (tmp_path / "report.h5").exists()
 
 
+@pytest.mark.slow
 def test_a_part_that_no_camera_sees_is_not_seen(
     run: Run, tmp_path: Path, session: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

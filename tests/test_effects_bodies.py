@@ -86,6 +86,7 @@ def test_free_fall_is_exact_at_any_step(step_s: float) -> None:
     assert np.ptp(played.energy_j()) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_tumbling_box_keeps_its_energy() -> None:
     """About the middle axis, where turning is unstable and explicit steps gain energy."""
     keys: dict[str, Any] = {"angular_velocity_deg_s": [20, 1500, 20], "gravity": False}
@@ -188,6 +189,7 @@ def door_angles(step_s: float) -> NDArray[np.float64]:
     return angles
 
 
+@pytest.mark.slow
 def test_a_pendulum_swings_in_its_period() -> None:
     angles = door_angles(STEP_S)
     crossings = np.flatnonzero(np.diff(np.sign(angles)) != 0)
@@ -199,6 +201,7 @@ def test_a_pendulum_swings_in_its_period() -> None:
     assert 2 * STEP_S * np.diff(at).mean() == pytest.approx(period_s, rel=5e-5)
 
 
+@pytest.mark.slow
 def test_a_door_is_pushed_to_the_angle_of_the_block_that_pushed_it() -> None:
     keys = {"axis": [0, 0, 1], "anchor_mm": [0, 0, 0], "range_deg": [0, 100], "mass_kg": 2.0}
     keys |= {"restitution": 0.0, "friction_n_m": 5.0}
@@ -269,6 +272,7 @@ def test_a_gram_bears_a_tonne() -> None:
     assert_no_energy_but_the_hulls(played)
 
 
+@pytest.mark.slow
 def test_a_ball_is_held_between_two_hands() -> None:
     """They close to 90 mm on a ball of 100 mm, and stay."""
 
@@ -334,6 +338,7 @@ def test_what_a_hull_lifts_out_is_work_of_the_hull() -> None:
     assert_no_energy_but_the_hulls(played)
 
 
+@pytest.mark.slow
 def test_a_hull_that_flickers_gives_no_energy() -> None:
     played = stage(far(), [ball("ball", [0, 0, 0.1])], [rigid("ball", restitution=0.5)])
     for k in range(40):
@@ -345,6 +350,7 @@ def test_a_hull_that_flickers_gives_no_energy() -> None:
     assert played.column("ball", "position_m")[20:, 2].min() > 0.05 - 4 * fallen_m
 
 
+@pytest.mark.slow
 def test_a_second_between_frames() -> None:
     played = stage(far(), [ball("ball", [0, 0, 0.12])], [rigid("ball", restitution=0.8)])
     played.step(floor(), 500)
@@ -354,6 +360,7 @@ def test_a_second_between_frames() -> None:
     assert played.column("ball", "penetration_m").max() < 1.5 * SLOP_M
 
 
+@pytest.mark.slow
 def test_a_door_falls_to_its_stop_and_stays() -> None:
     keys = {"axis": [0, 1, 0], "anchor_mm": [0, 0, 0], "range_deg": [20, 170], "angle_deg": 60}
     keys |= {"mass_kg": 2.0, "restitution": 0.3}
@@ -369,6 +376,7 @@ def test_a_door_falls_to_its_stop_and_stays() -> None:
     np.testing.assert_allclose(played.column("door", "kinetic_j")[-20:], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_cup_is_not_filled() -> None:
     """What is not convex keeps its hollow: a ball lies in a bowl of five slabs, joined as one."""
     walls = [

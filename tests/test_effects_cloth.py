@@ -187,6 +187,7 @@ def test_a_bend_costs_what_a_plate_costs() -> None:
 # ---------------------------------------------------------------------------- in a hull
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", [None, (0.0, 1.0, 0.0)])
 def test_a_ball_that_comes_through_pushes_the_sheet_before_it(
     direction: tuple[float, float, float] | None,
@@ -213,6 +214,7 @@ def test_a_ball_that_comes_through_pushes_the_sheet_before_it(
     assert_no_energy_from_nowhere(rows)
 
 
+@pytest.mark.slow
 def test_what_a_ball_pushes_goes_as_fast_as_it() -> None:
     """Without weight on it, a sheet in one piece would go faster only if it were thrown."""
     hung = sheet((10, 12), direction=(0.0, 1.0, 0.0))
@@ -231,6 +233,7 @@ def test_what_a_ball_pushes_goes_as_fast_as_it() -> None:
     assert went_m / took_s == pytest.approx(speed_m_s, abs=2 * 0.0037 / took_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recovery", ["direction", "nearest"])
 def test_a_half_space_pushed_against_a_pinned_sheet_has_its_nodes_on_its_plane(
     recovery: str,
@@ -286,6 +289,7 @@ def test_a_still_hull_does_no_work_on_a_sheet_that_leans_on_it() -> None:
     assert energy.max() <= 1e-3 * np.abs(energy).max()
 
 
+@pytest.mark.slow
 def test_a_hull_without_an_end_near_moves_nothing_and_is_told() -> None:
     """Cameras that abstain see no background at all: the hull ends where none sees, metres away."""
     views = ring_views(4, 64, 48, 60.0, 8.0, unseen="keep")
@@ -419,6 +423,7 @@ def test_friction_decides_whether_it_slides_down_a_slope() -> None:
 # ---------------------------------------------------------------------------- as told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recovery", ["direction", "nearest"])
 def test_it_goes_on_from_a_state_to_the_same_bits(recovery: str) -> None:
     hung = sheet((6, 8), direction=(0.0, 1.0, 0.0))

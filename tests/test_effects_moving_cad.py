@@ -132,6 +132,7 @@ def test_a_bat_that_turns_hands_on_twice_the_speed_of_where_it_hits() -> None:
     assert told[-1]["velocity_m_s"] @ across > np.cos(np.radians(7.0)) * speed_m_s
 
 
+@pytest.mark.slow
 def test_a_lift_carries_what_stands_on_it_and_its_work_is_the_height() -> None:
     lift = moving(box("lift", [0.2, 0.2, 0.02], [0, 0, -0.02]), slide([0, 0, 0.25], 21))
     objects = [box("crate", [0.05, 0.05, 0.05], [0, 0, 0.05]), lift]

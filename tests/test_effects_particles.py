@@ -72,6 +72,7 @@ def level_views() -> Views:
     return make_views(names, np.array([[1000, 1000]] * 4), np.array(matrices))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unseen", ["carve", "keep"])
 def test_a_segment_enters_where_the_walk_of_its_ray_begins_to_be_inside(unseen: Unseen) -> None:
     views = ring_views(4, unseen=unseen, min_cameras=2 if unseen == "keep" else 1)
@@ -237,6 +238,7 @@ def test_without_loss_energy_stays_and_none_comes_from_nowhere(step_s: float) ->
     assert changed.min() > -3 * 1e-3
 
 
+@pytest.mark.slow
 def test_none_is_in_the_hull_after_any_step() -> None:
     hull = ball_hull(VIEWS, np.array([0.0, 0.0, 0.1]), 0.3)
     swarm = particles(
@@ -285,6 +287,7 @@ def test_what_is_fast_does_not_pass_through_a_thin_hull() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_particle_is_thrown_off_a_ball_about_its_normal() -> None:
     center, radius_m = np.zeros(3), 0.3
     views = ring_views(5, width=1440, height=972, focal_px=1400.0)
@@ -475,6 +478,7 @@ def test_the_oldest_make_room_and_the_old_are_gone() -> None:
     assert swarm.values(None)["it"]["n_alive"] == pytest.approx(50, abs=STEP_S * 1000)
 
 
+@pytest.mark.slow
 def test_the_same_to_the_bit_with_any_number_of_threads_and_after_a_restart() -> None:
     hull = ball_hull(VIEWS, np.array([0.0, 0.0, 0.1]), 0.3)
     keys: dict[str, Any] = {

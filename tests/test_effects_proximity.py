@@ -181,6 +181,7 @@ def test_nothing_real_exposes_nothing() -> None:
     assert (told["time_in_zone_s"] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_what_is_touched_is_exposed_at_full_strength() -> None:
     views = ring_views(4)
     hull = ball_hull(views, np.zeros(3), 0.3)

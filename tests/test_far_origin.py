@@ -47,6 +47,7 @@ def report_of(run: Run, folder: Path, shift_m: NDArray[np.float64]) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_m", [(10_000, -200, 3), (5_000_000, 3_000_000, -4_000_000)])
 def test_nothing_is_lost_far_from_the_origin(
     run: Run, tmp_path: Path, shift_m: tuple[float, float, float]

@@ -168,6 +168,7 @@ def test_contact_begins_where_the_object_was_free_a_frame_before(
     np.testing.assert_allclose(np.abs(entry.first_contact.point_world).max(), HALF_M, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_backtracking_begins_the_response_at_the_first_contact(
     session: Path, scene: Path, engine: Engine, results: list[FrameResult]
 ) -> None:

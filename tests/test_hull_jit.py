@@ -136,6 +136,7 @@ def test_in_a_folder_that_the_user_names_nothing_is_removed(
     assert (base / ("a" * 16)).exists()
 
 
+@pytest.mark.slow
 def test_to_load_what_is_compiled_touches_no_folder(tmp_path: Path) -> None:
     environment = os.environ | {"HYBRIDVE_CACHE": str(tmp_path / "cache")}
     environment.pop("NUMBA_CACHE_DIR", None)

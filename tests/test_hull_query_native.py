@@ -139,6 +139,7 @@ def test_no_meshes_and_empty_meshes_are_no_hits() -> None:
     assert len(hits) == 0
 
 
+@pytest.mark.slow
 def test_the_same_mesh_serves_other_cameras() -> None:
     mesh = sphere_mesh(500, 0.2)
     engine = Native(1)

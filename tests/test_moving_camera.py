@@ -347,6 +347,7 @@ def test_a_session_with_a_moving_camera_is_calibrated_and_evaluated(
             assert abs(one.clearance.upper_m - true.clearance.upper_m) < 0.008
 
 
+@pytest.mark.slow
 def test_doubt_comes_from_the_covariance_where_the_camera_was(
     scene: Path, engine: Engine, tmp_path: Path
 ) -> None:
@@ -495,6 +496,7 @@ def test_other_poses_are_other_settings(
     assert first["poses_sha256"]["head"] != second["poses_sha256"]["head"]
 
 
+@pytest.mark.slow
 def test_stored_silhouettes_serve_until_the_poses_change(
     scene: Path, tmp_path: Path, run: Run, engine: Engine, results: list[FrameResult]
 ) -> None:

@@ -206,6 +206,7 @@ def assert_same_finding(found: Finding, expected: Finding) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_moving_object_is_in_each_frame_as_one_that_rests_there(
     session: Path, engine: Engine, results: list[FrameResult], tmp_path: Path
 ) -> None:
@@ -241,6 +242,7 @@ def numbers(result: FrameResult) -> list[Any]:
     return said
 
 
+@pytest.mark.slow
 def test_identity_poses_leave_the_scene_as_it_is_to_the_bit(
     session: Path, engine: Engine, tmp_path: Path
 ) -> None:
@@ -268,6 +270,7 @@ def test_objects_at_rest_are_the_same_objects_in_every_frame(session: Path, tmp_
     assert standing.bodies is chain.bodies
 
 
+@pytest.mark.slow
 def test_a_run_that_is_taken_up_says_the_same_to_the_bit(
     session: Path, scene: Path, engine: Engine
 ) -> None:
@@ -655,6 +658,7 @@ def report(chain: Chain, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_points_of_a_report_lie_on_the_mesh_as_it_stood(
     report: Path, results: list[FrameResult]
 ) -> None:
@@ -704,6 +708,7 @@ def test_vtk_shows_the_object_where_it_was(report: Path) -> None:
         assert cell.GetNumberOfPoints() == 3
 
 
+@pytest.mark.slow
 def test_a_report_that_was_cut_off_is_taken_up_to_the_same_bits(
     chain: Chain, report: Path, tmp_path: Path
 ) -> None:
@@ -784,6 +789,7 @@ def test_a_picture_shows_other_frames_otherwise(chain: Chain, engine: Engine) ->
 MOVE = Move(np.array([1.0, 0.0, 0.0]), -0.1, 0.5, 2e-3)
 
 
+@pytest.mark.slow
 def test_spacing_blocks_what_replays_of_objects_at_rest_block(
     session: Path, scene: Path, tmp_path: Path
 ) -> None:

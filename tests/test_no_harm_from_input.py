@@ -330,6 +330,7 @@ def test_what_crashes_hdf5_is_a_line_and_what_passes_is_looked_through_once(
     assert asked == [copy, copy]
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_of_a_file_is_followed_by_another(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     write_clash_report(path, [[]])

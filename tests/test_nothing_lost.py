@@ -85,6 +85,7 @@ def which(count: int, most: int) -> list[int]:
     return sorted({1, 2, *(round(1 + n * (count - 1) / (most - 3)) for n in range(most - 2))})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stays", [True, False], ids=["full", "hiccup"])
 @pytest.mark.parametrize("name", list(WRITERS))
 def test_whichever_write_fails_the_old_file_or_the_whole_new_one_stands(
@@ -114,6 +115,7 @@ def test_whichever_write_fails_the_old_file_or_the_whole_new_one_stands(
         assert "space" in told or (not told and left == whole), (k, disk.asked[k - 1])
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_whatever_parts_a_full_disk_has_left(tmp_path: Path) -> None:
     report(tmp_path / "report.h5")
     expected = read_report(tmp_path / "report.h5")

@@ -85,6 +85,7 @@ def test_a_private_name_of_another_module_is_told() -> None:
     assert private_names_of_others(source) == ["_b", "_f", "_g"]
 
 
+@pytest.mark.slow
 def test_no_module_takes_what_another_keeps_to_itself() -> None:
     for folder in ("cli", "hull", "calib"):
         for path in (PROJECT / folder).rglob("*.py"):

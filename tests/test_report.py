@@ -668,6 +668,7 @@ def test_a_witness_counts_as_a_collision_and_open_is_not_free(tmp_path: Path) ->
     assert second["open_at_m"] == 3e-4
 
 
+@pytest.mark.slow
 def test_a_distance_is_kept_only_if_every_frame_is_evaluated_and_proved(tmp_path: Path) -> None:
     free, sampled = FREE, free_contact("")
     path = tmp_path / "report.h5"

@@ -85,6 +85,7 @@ def test_a_status_and_its_comment_survive_ten_runs_of_places_that_waver(
     assert entry.comment == 'a "sleeve"\n#1'
 
 
+@pytest.mark.slow
 def test_new_becomes_active_in_the_next_run_and_not_by_looking_twice(
     tmp_path: Path, empty: Ledger
 ) -> None:
@@ -97,6 +98,7 @@ def test_new_becomes_active_in_the_next_run_and_not_by_looking_twice(
     assert again == ledger
 
 
+@pytest.mark.slow
 def test_what_is_gone_is_resolved_and_found_again_it_is_new(tmp_path: Path, empty: Ledger) -> None:
     ledger, first = list_of(tmp_path, empty, 0, Spot(LEFT), Spot(RIGHT, 0.02))
     name = first[LEFT].entry.id
@@ -124,6 +126,7 @@ def test_resolved_by_hand_stays_so_until_another_run_finds_it(
     assert later[LEFT].entry.status == "new"
 
 
+@pytest.mark.slow
 def test_several_reports_share_a_ledger_and_a_clash_is_resolved_when_none_has_it(
     tmp_path: Path, empty: Ledger
 ) -> None:

@@ -460,6 +460,7 @@ def test_what_cannot_be_done_is_said_in_one_line(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_interrupted_it_leaves_nothing_behind(tmp_path: Path) -> None:
     def interrupt(what: str, done: int, total: int) -> None:
         if done == 1:

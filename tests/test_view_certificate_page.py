@@ -187,6 +187,7 @@ def test_the_page_says_what_the_certificate_says(
     assert len(page.images()) == len(certificate.cameras) + 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_there", [True, False])
 def test_a_second_opinion_is_told_or_why_there_is_none(tmp_path: Path, is_there: bool) -> None:
     rig, certificate, seen, volume = case_of(["left", "right"])
@@ -199,6 +200,7 @@ def test_a_second_opinion_is_told_or_why_there_is_none(tmp_path: Path, is_there:
         assert words in page.text, words
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_and_nothing_runs(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:
@@ -219,6 +221,7 @@ def test_nothing_is_fetched_and_nothing_runs(
             assert not element.tag.endswith("script")
 
 
+@pytest.mark.slow
 def test_markup_in_names_and_values_is_text(tmp_path: Path) -> None:
     bad = '<script>alert("1")</script>&amp;\'$x_$ --> \u4e8c'
     case = case_of([bad, "b"])
@@ -291,6 +294,7 @@ def test_a_volume_that_nobody_sees_has_a_page(
     assert "nothing limits it" in page.text
 
 
+@pytest.mark.slow
 def test_the_first_sight_follows_the_gate_and_the_warnings(
     tmp_path: Path, two: tuple[Rig, Certificate, dict[str, SeenPoints], Volume]
 ) -> None:

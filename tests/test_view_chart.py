@@ -54,6 +54,7 @@ def lines_of(figure: Figure, panel: int) -> list[tuple[list[float], list[float]]
     ]
 
 
+@pytest.mark.slow
 def test_the_picture_shows_every_engine_in_a_colour_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "chart.png"
 

@@ -173,6 +173,7 @@ def test_from_a_cameras_place_one_sees_its_silhouette(device: moderngl.Context) 
     assert on_object.sum() > 100
 
 
+@pytest.mark.slow
 def test_normals_point_out_of_the_hull_and_towards_the_eye(device: moderngl.Context) -> None:
     """Many cameras make a ball of the hull of a ball: its normals are those of a sphere."""
     views = ring_views(24, distance_m=3.0)
@@ -255,6 +256,7 @@ def test_a_smaller_target_than_before_is_not_cut_by_an_old_rectangle(
     assert seen[1].sum() != seen[0].sum()
 
 
+@pytest.mark.slow
 def test_the_cells_contain_the_hull() -> None:
     rng = np.random.default_rng(1)
     for seed in range(6):

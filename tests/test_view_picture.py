@@ -98,6 +98,7 @@ def test_an_object_half_in_the_hull_is_cut_by_its_surface(scene: tuple[Hull, Rig
     assert is_blue_grey(middle_row).sum() > 0.3 * is_warm_grey(middle_row).sum()
 
 
+@pytest.mark.slow
 def test_what_touches_is_red_and_what_is_free_is_not(scene: tuple[Hull, Rig]) -> None:
     """A box dips into the ball; the same box is drawn as if it were free."""
     view = view_from(3, 1.5, 1.5)
@@ -112,6 +113,7 @@ def test_what_touches_is_red_and_what_is_free_is_not(scene: tuple[Hull, Rig]) ->
     assert none[50:150, 110:210].sum() == 0
 
 
+@pytest.mark.slow
 def test_what_a_lamp_does_not_reach_is_darker_triangle_by_triangle(scene: tuple[Hull, Rig]) -> None:
     front = box("front", (1.0, 0.0, 0.0), 0.4)
     view, count = view_from(4, 0, 0), len(front.faces)
@@ -166,6 +168,7 @@ def test_an_object_around_the_viewer_is_cut_where_it_passes_behind(
     assert is_warm_grey(image[MIDDLE]).mean() > MOST
 
 
+@pytest.mark.slow
 def test_title_and_caption_stand_above(scene: tuple[Hull, Rig]) -> None:
     view = view_from(3, -2, 1.5)
     without = draw_picture(*scene, [], viewpoint=view, size_px=SIZE_PX)
@@ -406,6 +409,7 @@ def test_a_picture_does_not_replace_a_folder(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["picture.png"]
 
 
+@pytest.mark.slow
 def test_importing_pictures_loads_no_mesh_library() -> None:
     code = "import sys, hybridve.hull.view.picture; print('open3d' in sys.modules)"
     answer = subprocess.run(

@@ -140,6 +140,7 @@ def test_from_a_cameras_own_place_the_hull_is_its_silhouette(unseen: str) -> Non
             assert (drawn & silhouette).sum() / silhouette.sum() > 0.98
 
 
+@pytest.mark.slow
 def test_between_cameras_the_hull_looks_as_the_thing_does(device: moderngl.Context) -> None:
     balls: list[Ball] = [((0.0, 0.0, 0.0), 0.4, None)]
     hull, images = seen_by(ring_views(16), balls)
@@ -155,6 +156,7 @@ def test_between_cameras_the_hull_looks_as_the_thing_does(device: moderngl.Conte
     assert np.square(error).mean() < 0.15 * np.square(plain).mean()
 
 
+@pytest.mark.slow
 def test_what_the_hull_hides_from_a_camera_takes_no_colour_from_it(
     device: moderngl.Context,
 ) -> None:
@@ -181,6 +183,7 @@ def test_what_the_hull_hides_from_a_camera_takes_no_colour_from_it(
     assert (is_red & truly_green).sum() < 0.02 * truly_green.sum()
 
 
+@pytest.mark.slow
 def test_what_no_camera_with_a_picture_sees_has_no_colour(device: moderngl.Context) -> None:
     """Only the camera at the other side has one: from here next to nothing is told."""
     views = ring_views(6)

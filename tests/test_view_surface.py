@@ -47,6 +47,7 @@ def test_points_of_the_surface_are_at_the_border_of_the_hull() -> None:
         assert (inside == is_inside).mean() > 0.98
 
 
+@pytest.mark.slow
 def test_finer_cells_come_nearer_to_a_limit() -> None:
     volumes = [solid(hull_surface(ball_hull(), cell_m=cell)).volume for cell in (0.04, 0.02, 0.01)]
 

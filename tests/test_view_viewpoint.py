@@ -94,6 +94,7 @@ def test_cameras_looking_straight_down_leave_z_up() -> None:
     np.testing.assert_array_equal(up_axis(Rig(tuple(cameras))), [0.0, 0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_cameras_are_in_the_picture_where_they_stand_near() -> None:
     """A ring close around a large ball fits; one far around a small ball would make it a dot."""
     near = ring_views(6, focal_px=300.0, distance_m=1.4)
@@ -118,6 +119,7 @@ def test_a_huge_object_does_not_make_the_hull_a_dot() -> None:
     assert np.linalg.norm(viewpoint.eye_world) < 10.0
 
 
+@pytest.mark.slow
 def test_the_chosen_view_is_the_same_every_time() -> None:
     views = ring_views(5)
     hull, rig = ball_hull(views, np.zeros(3), 0.4), rig_of(views)
@@ -227,6 +229,7 @@ def test_dots_are_thinned_to_one_a_cell() -> None:
     assert len(thinned(np.zeros((0, 2)), 1.0)) == 0
 
 
+@pytest.mark.slow
 def test_in_focus_a_small_part_fills_the_picture() -> None:
     """Beside a ball ten times as large, which would make it a dot."""
     views = ring_views(4)
