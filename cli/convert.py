@@ -16,23 +16,6 @@ FormatName = Literal[
 _UNITS = ("m", "cm", "mm", "in", "ft")
 
 
-class ImageSize(click.ParamType[tuple[int, int]]):
-    """Width and height in pixels."""
-
-    name = "WIDTHxHEIGHT"
-
-    def convert(
-        self, value: str, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """Return the size, or fail with what was expected."""
-        if not isinstance(value, str):
-            return value
-        width, _, height = value.lower().partition("x")
-        if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
-            self.fail(f"{value!r} is not a size; expected 1920x1080", param, ctx)
-        return int(width), int(height)
-
-
 def _files(values: dict[str, Any]) -> options.Files:
     return options.Files(
         reads=options.given(values["rig"]),
@@ -70,7 +53,7 @@ def _files(values: dict[str, Any]) -> options.Files:
     "matrices (usually 0.5); the other formats fix it.",
 )
 @click.option(
-    "--image-size", type=ImageSize(), help="Size of RIG's images, where its files do not say."
+    "--image-size", type=options.Size(), help="Size of RIG's images, where its files do not say."
 )
 @click.option(
     "--camera",

@@ -24,6 +24,29 @@ FC = TypeVar("FC", bound=Callable[..., Any] | click.Command)
 _path = click.Path(path_type=Path)
 
 
+class Size(click.ParamType[tuple[int, int]]):
+    """Width and height in pixels, each within bounds."""
+
+    name = "WIDTHxHEIGHT"
+
+    def __init__(self, least: int = 1, most: int | None = None) -> None:
+        self._least, self._most = least, most
+
+    def convert(
+        self, value: str, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """Return the size, or fail with what was expected."""
+        if not isinstance(value, str):
+            return value
+        width, _, height = value.lower().partition("x")
+        if not (width.isdecimal() and height.isdecimal() and min(int(width), int(height)) > 0):
+            self.fail(f"{value!r} is not a size; expected 1920x1080", param, ctx)
+        size = (int(width), int(height))
+        if min(size) < self._least or (self._most is not None and max(size) > self._most):
+            self.fail(f"{value!r}: each side is {self._least} to {self._most} pixels", param, ctx)
+        return size
+
+
 class Frames(click.ParamType["FrameRange"]):
     """A range of frames, written as Python does."""
 

@@ -34,26 +34,6 @@ _HEAT_MM = 250.0
 _HEAT_FRAMES = 150
 
 
-class Size(click.ParamType[tuple[int, int]]):
-    """A picture's width and height."""
-
-    name = "WIDTHxHEIGHT"
-
-    def convert(
-        self, value: str, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """Return width and height in pixels, or fail with what was expected."""
-        if not isinstance(value, str):
-            return value
-        parts = value.lower().split("x")
-        if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-            self.fail(f"{value!r} is not a size; expected as 1280x800", param, ctx)
-        width, height = (int(part) for part in parts)
-        if not (16 <= width <= 8192 and 16 <= height <= 8192):
-            self.fail(f"{value!r}: each side is 16 to 8192 pixels", param, ctx)
-        return width, height
-
-
 def _files(values: dict[str, Any]) -> options.Files:
     return options.Files(
         reads=options.given(values["session"], values["scene"], values["report"], values["sim"]),
@@ -145,7 +125,7 @@ def _files(values: dict[str, Any]) -> options.Files:
 @click.option(
     "--size",
     "size_px",
-    type=Size(),
+    type=options.Size(16, 8192),
     help="Width and height. Default: 1600x1000; of films 1280x800.",
 )
 @options.engine_option
